@@ -1,0 +1,5 @@
+//! The camera: image size, intrinsics and lens distortion, and what follows from them.
+
+pub mod distortion;
+pub mod intrinsics;
+pub mod model;

@@ -1,0 +1,4 @@
+//! Images: pixel buffers, their pool, and what is done to pixels without knowing what they show.
+
+pub mod buffer;
+pub mod pool;

@@ -1,0 +1,9 @@
+//! endofield: endoscope video, clearer than the endoscope saw it, a moment later, always.
+
+pub mod camera;
+pub mod frame;
+pub mod geometry;
+pub mod image;
+pub mod light_field;
+pub mod pipeline;
+pub mod time;

