@@ -6,4 +6,5 @@ pub mod geometry;
 pub mod image;
 pub mod light_field;
 pub mod pipeline;
+pub mod progress;
 pub mod time;

@@ -6,12 +6,12 @@ use std::path::{Path, PathBuf};
 
 /// Rooms by floor, bottom first. A room that is not here fails the test.
 const FLOORS: &[&[&str]] = &[
-    &["geometry", "image", "solver", "time"],
-    &["camera", "robot"],
-    &["frame", "light_field", "synthetic"],
+    &["geometry", "image", "solver", "time", "progress"],
+    &["camera", "media", "quality", "robot"],
+    &["frame", "light_field", "recording", "synthetic"],
     &["pipeline", "localization"],
     &["sources", "stages", "sinks"],
-    &["config", "quality"],
+    &["config"],
     &["compose"],
     &["cli"],
 ];
