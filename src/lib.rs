@@ -1,10 +1,12 @@
 //! endofield: endoscope video, clearer than the endoscope saw it, a moment later, always.
 
 pub mod camera;
+pub mod cli;
 pub mod frame;
 pub mod geometry;
 pub mod image;
 pub mod light_field;
 pub mod pipeline;
 pub mod progress;
+pub mod synthetic;
 pub mod time;

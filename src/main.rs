@@ -1,3 +1,5 @@
 //! The `endofield` command.
 
-fn main() {}
+fn main() -> anyhow::Result<()> {
+    endofield::cli::main()
+}
