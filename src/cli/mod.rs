@@ -9,6 +9,9 @@ use crate::progress::Silent;
 #[derive(Debug, Parser)]
 #[command(name = "endofield", version)]
 struct Cli {
+    /// Overwrite what is there.
+    #[arg(long, global = true)]
+    force: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -21,7 +24,11 @@ enum Command {
 
 /// Run the command line.
 pub fn main() -> anyhow::Result<()> {
-    match Cli::parse().command {
-        Command::Simulate(args) => simulate::run(args, &Silent),
+    let cli = Cli::parse();
+    match cli.command {
+        Command::Simulate(mut args) => {
+            args.force = cli.force;
+            simulate::run(args, &Silent)
+        }
     }
 }
