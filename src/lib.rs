@@ -7,4 +7,7 @@ pub mod image;
 pub mod light_field;
 pub mod pipeline;
 pub mod progress;
+pub mod recording;
+pub mod robot;
 pub mod time;
+pub mod yaml;

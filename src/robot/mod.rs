@@ -1,0 +1,3 @@
+pub mod hand_eye;
+pub mod quaternion;
+pub mod trajectory;
