@@ -1,0 +1,4 @@
+//! What happens to a frame, one room per stage, in line order.
+
+pub mod scene_cut;
+pub mod temporal_median;
