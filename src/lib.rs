@@ -16,5 +16,6 @@ pub mod robot;
 pub mod sinks;
 pub mod sources;
 pub mod stages;
+pub mod synthetic;
 pub mod time;
 pub mod yaml;

@@ -5,6 +5,7 @@ pub mod context;
 pub mod outputs;
 pub mod process;
 pub mod report;
+pub mod simulate;
 
 use std::ffi::OsString;
 use std::process::ExitCode;
@@ -40,6 +41,7 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Process(process::Args),
+    Simulate(simulate::Args),
 }
 
 /// Run the command line; its outcome as the process's exit code.
@@ -88,6 +90,7 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
 fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
         Command::Process(args) => process::run(&args, context),
+        Command::Simulate(args) => simulate::run(args, context),
     }
 }
 
