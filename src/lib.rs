@@ -9,3 +9,4 @@ pub mod pipeline;
 pub mod progress;
 pub mod stages;
 pub mod time;
+pub mod yaml;

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 /// Rooms by floor, bottom first. A room that is not here fails the test.
 const FLOORS: &[&[&str]] = &[
-    &["geometry", "image", "solver", "time", "progress"],
+    &["geometry", "image", "solver", "time", "progress", "yaml"],
     &["camera", "media", "quality", "robot"],
     &["frame", "light_field", "recording", "synthetic"],
     &["pipeline", "localization"],
