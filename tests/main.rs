@@ -1,6 +1,11 @@
 //! The integration tests, one binary.
 
 mod architecture;
+mod cli;
+mod color;
+mod config;
+mod determinism;
 mod media;
 mod pipeline;
 mod support;
+mod temporal_median;

@@ -1,4 +1,5 @@
 //! What happens to a frame, one room per stage, in line order.
 
+pub mod color_normalization;
 pub mod scene_cut;
 pub mod temporal_median;
