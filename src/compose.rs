@@ -10,7 +10,10 @@ use crate::config::Config;
 use crate::light_field::view::LightField;
 use crate::pipeline::stage::Stage;
 use crate::recording::folder::Recording;
-use crate::stages::temporal_median::{self, stage::TemporalMedian};
+use crate::stages::color_normalization::color_file::ColorFile;
+use crate::stages::color_normalization::stage::ColorNormalization;
+use crate::stages::temporal_median::stage::TemporalMedian;
+use crate::stages::{color_normalization, temporal_median};
 
 /// A part of the line that a user chooses by name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum, serde::Serialize)]
@@ -81,9 +84,15 @@ pub struct Line {
 /// Why a line cannot be put together.
 #[derive(Debug, thiserror::Error)]
 pub enum ComposeError {
-    /// A setting of the temporal median is out of bounds.
+    /// The temporal median's settings.
     #[error(transparent)]
     Median(#[from] temporal_median::settings::SettingsError),
+    /// Color normalization's settings or table.
+    #[error(transparent)]
+    Color(#[from] color_normalization::stage::ColorError),
+    /// `color.yaml`.
+    #[error(transparent)]
+    ColorFile(#[from] color_normalization::color_file::ColorFileError),
 }
 
 impl fmt::Debug for Line {
@@ -93,13 +102,28 @@ impl fmt::Debug for Line {
     }
 }
 
+impl Line {
+    fn leave_out(&mut self, stage: Choice, why: impl Into<String>) {
+        self.left_out.push(LeftOut { stage, why: why.into() });
+    }
+}
+
 /// Put the wanted stages together, as far as the equipment allows.
 pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Result<Line, ComposeError> {
-    let mut line = Line { stages: Vec::new(), left_out: Vec::new(), output_camera: None };
+    let recording = equipment.recording;
     let wants = |choice: Choice| wanted.contains(&choice);
+    let mut line = Line { stages: Vec::new(), left_out: Vec::new(), output_camera: None };
+
     if wants(Choice::Median) {
         line.stages.push(Box::new(TemporalMedian::new(&config.median)?));
     }
-    let _ = equipment;
+    if wants(Choice::Color) {
+        let color_file = recording.color.as_deref().map(ColorFile::read).transpose()?;
+        let stage = ColorNormalization::new(&config.color, color_file.as_ref())?;
+        match stage.idle_reason() {
+            Some(why) => line.leave_out(Choice::Color, why),
+            None => line.stages.push(Box::new(stage)),
+        }
+    }
     Ok(line)
 }

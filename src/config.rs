@@ -9,7 +9,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::stages::temporal_median;
+use crate::stages::{color_normalization, temporal_median};
 
 /// One `key=value` of `--set`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -114,6 +114,8 @@ pub struct Config {
     pub output: OutputSettings,
     /// The temporal color median.
     pub median: temporal_median::settings::Settings,
+    /// Color normalization.
+    pub color: color_normalization::settings::Settings,
 }
 
 impl Config {
@@ -168,7 +170,8 @@ impl Config {
         within("line.frames_between_stages", self.line.frames_between_stages, 1, 64)?;
         within("line.frames_before_sinks", self.line.frames_before_sinks, 1, 256)?;
         within("output.crf", usize::from(self.output.crf), 0, 51)?;
-        self.median.check().map_err(|error| error.to_string())
+        self.median.check().map_err(|error| error.to_string())?;
+        self.color.check().map_err(|error| error.to_string())
     }
 }
 

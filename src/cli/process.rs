@@ -18,6 +18,7 @@ use crate::media::writer::{Output, Sound, VideoWriter, WriterSettings};
 use crate::pipeline::builder::Pipeline;
 use crate::pipeline::queue::Queue;
 use crate::pipeline::runner::Wish;
+use crate::pipeline::stage::Sink;
 use crate::progress::Progress as _;
 use crate::recording::folder::{Recording, Video};
 use crate::sinks::mask::MaskSink;
@@ -76,7 +77,7 @@ pub struct Processed {
 
 /// Run it, and say what came of it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
-    let Processed { ended, report } = process(args, context)?;
+    let Processed { ended, report } = process(args, context, Vec::new())?;
     for fault in &report.faults {
         tracing::error!("{fault}");
     }
@@ -93,8 +94,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     Ok(ended)
 }
 
-/// The work itself, for this command and for `demo`.
-pub fn process(args: &Args, context: &Context) -> anyhow::Result<Processed> {
+/// The work itself, for this command and for `demo`; `extra` sinks see each finished frame, with the picture as it came.
+pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> anyhow::Result<Processed> {
     let span = TimeSpan::checked(args)?;
     let output = Output::from_argument(&args.output).map_err(|error| UsageError(error.to_string()))?;
     let recording = open_recording(&args.input)?;
@@ -129,7 +130,7 @@ pub fn process(args: &Args, context: &Context) -> anyhow::Result<Processed> {
     let mut builder = Pipeline::builder(Box::new(source), Arc::clone(&clock))
         .entry(Queue::blocking(context.config.line.frames_between_stages))
         .between_stages(context.config.line.frames_between_stages)
-        .keep_original(args.side_by_side.is_some());
+        .keep_original(args.side_by_side.is_some() || !extra.is_empty());
     for stage in stages {
         builder = builder.stage(stage);
     }
@@ -143,6 +144,9 @@ pub fn process(args: &Args, context: &Context) -> anyhow::Result<Processed> {
         let output = Output::from_argument(path).map_err(|error| UsageError(error.to_string()))?;
         let wide = WriterSettings { width: SideBySideSink::output_width(info.width), sound: None, ..writing.clone() };
         builder = builder.sink(Box::new(SideBySideSink::new(VideoWriter::create(&output, &wide, context.force)?)), queue);
+    }
+    for sink in extra {
+        builder = builder.essential_sink(sink, queue);
     }
     let (sink, gathered) = ReportSink::new();
     let running = builder.sink(Box::new(sink), queue).build()?;
