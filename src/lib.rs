@@ -11,6 +11,7 @@ pub mod light_field;
 pub mod media;
 pub mod pipeline;
 pub mod progress;
+pub mod quality;
 pub mod recording;
 pub mod robot;
 pub mod sinks;

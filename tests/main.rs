@@ -5,6 +5,7 @@ mod cli;
 mod color;
 mod config;
 mod determinism;
+mod light_field;
 mod media;
 mod pipeline;
 mod support;

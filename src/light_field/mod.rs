@@ -1,10 +1,16 @@
 //! The light field: colour as a function of point and direction, held as posed views over a surface (freeform, unstructured).
 
+pub mod build;
 pub mod colmap;
+pub mod confidence;
+pub mod depth;
 pub mod error;
+pub mod evaluate;
 pub mod file;
+pub mod photometry;
 pub mod ply;
 pub mod rasterize;
 pub mod renderer;
+pub mod surface;
 pub mod undistort;
 pub mod view;
