@@ -7,4 +7,5 @@ pub mod image;
 pub mod light_field;
 pub mod pipeline;
 pub mod progress;
+pub mod solver;
 pub mod time;

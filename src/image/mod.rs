@@ -1,4 +1,8 @@
 //! Images: pixel buffers, their pool, and what is done to pixels without knowing what they show.
 
 pub mod buffer;
+pub mod corners;
+pub mod gradient;
+pub mod patch;
 pub mod pool;
+pub mod pyramid;
