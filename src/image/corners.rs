@@ -52,7 +52,11 @@ pub fn corners(image: &Image<f32>, valid: &Mask, choice: &CornerChoice) -> Vec<C
                 for x in left..(left + cell).min(width - margin) {
                     let s = strength.at(x, y);
                     if s >= choice.min_strength && valid.at(x, y) != 0 && is_peak(&strength, x, y) {
-                        in_cell.push(Corner { x: x as f32, y: y as f32, strength: s });
+                        in_cell.push(Corner {
+                            x: x as f32,
+                            y: y as f32,
+                            strength: s,
+                        });
                     }
                 }
             }
@@ -66,7 +70,11 @@ pub fn corners(image: &Image<f32>, valid: &Mask, choice: &CornerChoice) -> Vec<C
 fn is_peak(strength: &Image<f32>, x: usize, y: usize) -> bool {
     let s = strength.at(x, y);
     for (v, before) in [(y - 1, true), (y, true), (y, false), (y + 1, false)] {
-        let columns = if v == y { if before { x - 1..x } else { x + 1..x + 2 } } else { x - 1..x + 2 };
+        let columns = if v == y {
+            if before { x - 1..x } else { x + 1..x + 2 }
+        } else {
+            x - 1..x + 2
+        };
         for u in columns {
             let other = strength.at(u, v);
             // Ties go to the first in reading order, so that a plateau gives one corner.
@@ -106,7 +114,10 @@ fn box_sums(values: &[[f32; 3]], width: usize, height: usize) -> Vec<[f32; 3]> {
         for x in 0..width + r {
             for c in 0..3 {
                 sum[c] += row.get(x).map_or(0.0, |v| f64::from(v[c]));
-                sum[c] -= x.checked_sub(2 * r + 1).and_then(|left| row.get(left)).map_or(0.0, |v| f64::from(v[c]));
+                sum[c] -= x
+                    .checked_sub(2 * r + 1)
+                    .and_then(|left| row.get(left))
+                    .map_or(0.0, |v| f64::from(v[c]));
             }
             if let Some(out) = x.checked_sub(r).and_then(|x| out.get_mut(x)) {
                 *out = sum.map(|s| s as f32);
@@ -144,7 +155,9 @@ mod tests {
     fn box_sums_agree_with_the_plain_double_loop() {
         let (width, height) = (23, 17);
         let mut rng = ChaCha8Rng::seed_from_u64(5);
-        let values: Vec<[f32; 3]> = (0..width * height).map(|_| [0; 3].map(|_: i32| rng.random_range(0.0..9.0))).collect();
+        let values: Vec<[f32; 3]> = (0..width * height)
+            .map(|_| [0; 3].map(|_: i32| rng.random_range(0.0..9.0)))
+            .collect();
         let fast = box_sums(&values, width, height);
         let r = WINDOW_RADIUS_PX as isize;
         for y in 0..height {
@@ -178,7 +191,12 @@ mod tests {
                 valid.set(x, y, 0);
             }
         }
-        let choice = CornerChoice { cells: 12, per_cell: 1, min_strength: 10.0, margin: 6 };
+        let choice = CornerChoice {
+            cells: 12,
+            per_cell: 1,
+            min_strength: 10.0,
+            margin: 6,
+        };
         let found = corners(&image, &valid, &choice);
         assert!(found.len() >= 4);
         for corner in found {

@@ -59,7 +59,12 @@ fn is_valid(mask: &Mask, x: f32, y: f32) -> bool {
 impl Template {
     /// The patch around (`x`, `y`); `None` if too little of it is valid.
     pub fn new(image: &Image<f32>, valid: &Mask, x: f32, y: f32) -> Option<Self> {
-        let mut template = Self { values: [0.0; AREA], along_x: [0.0; AREA], along_y: [0.0; AREA], valid: [false; AREA] };
+        let mut template = Self {
+            values: [0.0; AREA],
+            along_x: [0.0; AREA],
+            along_y: [0.0; AREA],
+            valid: [false; AREA],
+        };
         let mut count = 0;
         for (row, dy) in (-(PATCH_RADIUS_PX as isize)..=PATCH_RADIUS_PX as isize).enumerate() {
             for (column, dx) in (-(PATCH_RADIUS_PX as isize)..=PATCH_RADIUS_PX as isize).enumerate() {
@@ -198,8 +203,15 @@ impl Sums {
     }
 
     fn zncc(&self) -> f32 {
-        let (tt, ii) = (self.covariance(self.tt, self.t, self.t), self.covariance(self.ii, self.i, self.i));
-        if tt < 1e-3 || ii < 1e-3 { 0.0 } else { self.covariance(self.ti, self.t, self.i) / (tt * ii).sqrt() }
+        let (tt, ii) = (
+            self.covariance(self.tt, self.t, self.t),
+            self.covariance(self.ii, self.i, self.i),
+        );
+        if tt < 1e-3 || ii < 1e-3 {
+            0.0
+        } else {
+            self.covariance(self.ti, self.t, self.i) / (tt * ii).sqrt()
+        }
     }
 
     /// The Gauss–Newton step in template coordinates with offset (means) and gain (the direction t) projected out.
@@ -213,7 +225,10 @@ impl Sums {
         if gain < 0.1 {
             return None;
         }
-        let (xt, yt) = (self.covariance(self.xt, self.x, self.t), self.covariance(self.yt, self.y, self.t));
+        let (xt, yt) = (
+            self.covariance(self.xt, self.x, self.t),
+            self.covariance(self.yt, self.y, self.t),
+        );
         let xx = self.covariance(self.xx, self.x, self.x) - xt * xt / tt;
         let xy = self.covariance(self.xy, self.x, self.y) - xt * yt / tt;
         let yy = self.covariance(self.yy, self.y, self.y) - yt * yt / tt;
@@ -234,7 +249,10 @@ mod tests {
     use super::*;
 
     fn wave(x: f32, y: f32) -> f32 {
-        128.0 + 40.0 * (0.31 * x + 0.12 * y).sin() + 30.0 * (0.23 * y - 0.17 * x).cos() + 10.0 * (0.5 * x).sin() * (0.41 * y).cos()
+        128.0
+            + 40.0 * (0.31 * x + 0.12 * y).sin()
+            + 30.0 * (0.23 * y - 0.17 * x).cos()
+            + 10.0 * (0.5 * x).sin() * (0.41 * y).cos()
     }
 
     fn picture(f: impl Fn(f32, f32) -> f32) -> Image<f32> {
@@ -279,6 +297,10 @@ mod tests {
         let flat = Image::filled(96, 80, 90.0f32);
         let valid = Image::filled(96, 80, 255u8);
         let template = Template::new(&flat, &valid, 48.0, 40.0).unwrap();
-        assert!(template.locate(&flat, &valid, [[1.0, 0.0], [0.0, 1.0]], (48.0, 40.0), 8.0, 10).is_none());
+        assert!(
+            template
+                .locate(&flat, &valid, [[1.0, 0.0], [0.0, 1.0]], (48.0, 40.0), 8.0, 10)
+                .is_none()
+        );
     }
 }

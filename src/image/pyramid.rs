@@ -20,7 +20,9 @@ impl Pyramid {
     pub fn new(image: Image<f32>, valid: Mask, count: usize) -> Self {
         let (mut levels, mut masks) = (vec![image], vec![valid]);
         while levels.len() < count {
-            let (Some(image), Some(mask)) = (levels.last(), masks.last()) else { break };
+            let (Some(image), Some(mask)) = (levels.last(), masks.last()) else {
+                break;
+            };
             if image.width().min(image.height()) < 48 {
                 break;
             }
@@ -109,7 +111,10 @@ mod tests {
         let mut mask = Image::filled(16, 16, 255u8);
         mask.set(7, 6, 0);
         let half = halved_mask(&mask);
-        let spoilt: Vec<_> = (0..8).flat_map(|y| (0..8).map(move |x| (x, y))).filter(|p| half.at(p.0, p.1) == 0).collect();
+        let spoilt: Vec<_> = (0..8)
+            .flat_map(|y| (0..8).map(move |x| (x, y)))
+            .filter(|p| half.at(p.0, p.1) == 0)
+            .collect();
         assert_eq!(spoilt, [(3, 3), (4, 3)]);
     }
 }

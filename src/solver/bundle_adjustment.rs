@@ -46,7 +46,14 @@ impl Pinhole {
 
     fn slope(&self, p: &Vector3<f64>) -> Matrix2x3<f64> {
         let z = 1.0 / p.z;
-        Matrix2x3::new(self.fx * z, 0.0, -self.fx * p.x * z * z, 0.0, self.fy * z, -self.fy * p.y * z * z)
+        Matrix2x3::new(
+            self.fx * z,
+            0.0,
+            -self.fx * p.x * z * z,
+            0.0,
+            self.fy * z,
+            -self.fy * p.y * z * z,
+        )
     }
 }
 
@@ -82,9 +89,13 @@ impl PosePrior {
         let relative = self.mean.rotation.inverse() * pose.rotation;
         let half = relative.scaled_axis() * 0.5;
         let mut slope = Matrix6::zeros();
-        slope.fixed_view_mut::<3, 3>(0, 0).copy_from(relative.to_rotation_matrix().matrix());
+        slope
+            .fixed_view_mut::<3, 3>(0, 0)
+            .copy_from(relative.to_rotation_matrix().matrix());
         // Inverse right Jacobian of the rotation group to first order in the (small) deviation.
-        slope.fixed_view_mut::<3, 3>(3, 3).copy_from(&(Matrix3::identity() + half.cross_matrix()));
+        slope
+            .fixed_view_mut::<3, 3>(3, 3)
+            .copy_from(&(Matrix3::identity() + half.cross_matrix()));
         slope
     }
 }
@@ -185,13 +196,21 @@ impl Problem {
                 seen.iter()
                     .map(|o| {
                         let p = from_world[o.view].transform_point(&(*point).into()).coords;
-                        let s = self.camera.project(&p).map_or(COST_BEHIND, |q| (q - o.pixel).norm_squared() * weight);
+                        let s = self
+                            .camera
+                            .project(&p)
+                            .map_or(COST_BEHIND, |q| (q - o.pixel).norm_squared() * weight);
                         self.loss.cost(s)
                     })
                     .sum()
             })
             .collect();
-        let priors: f64 = self.priors.iter().zip(poses).filter_map(|(prior, pose)| Some(self.prior_cost(prior.as_ref()?, pose))).sum();
+        let priors: f64 = self
+            .priors
+            .iter()
+            .zip(poses)
+            .filter_map(|(prior, pose)| Some(self.prior_cost(prior.as_ref()?, pose)))
+            .sum();
         sums.iter().sum::<f64>() + priors
     }
 
@@ -202,7 +221,9 @@ impl Problem {
 
     /// Reprojection error of an observation of `point`, px; `None` behind the camera.
     pub fn error_px(&self, point: usize, observation: &Observation) -> Option<f64> {
-        let p = self.poses[observation.view].inverse_transform_point(&self.points[point].into()).coords;
+        let p = self.poses[observation.view]
+            .inverse_transform_point(&self.points[point].into())
+            .coords;
         Some((self.camera.project(&p)? - observation.pixel).norm())
     }
 
@@ -221,7 +242,12 @@ impl Problem {
     /// Improve poses and points until nothing gains, at most `max_iterations` accepted steps.
     pub fn adjust(&mut self, max_iterations: usize) -> Summary {
         let initial_cost = self.cost();
-        let mut summary = Summary { iterations: 0, initial_cost, final_cost: initial_cost, converged: false };
+        let mut summary = Summary {
+            iterations: 0,
+            initial_cost,
+            final_cost: initial_cost,
+            converged: false,
+        };
         let mut damping = 1e-4;
         while summary.iterations < max_iterations {
             let Some((poses, points)) = self.step(damping) else {
@@ -288,7 +314,9 @@ impl Problem {
         for a in 0..views {
             vector.fixed_rows_mut::<6>(6 * a).copy_from(&right[a]);
             for b in 0..=a {
-                system.fixed_view_mut::<6, 6>(6 * a, 6 * b).copy_from(&blocks[block_index(a, b)]);
+                system
+                    .fixed_view_mut::<6, 6>(6 * a, 6 * b)
+                    .copy_from(&blocks[block_index(a, b)]);
             }
             for d in 0..6 {
                 // A view that nothing holds stays where it is.
@@ -297,8 +325,12 @@ impl Problem {
         }
         // Only the lower triangle is read.
         let solution = system.cholesky()?.solve(&vector);
-        let poses =
-            self.poses.iter().enumerate().map(|(v, pose)| moved(pose, &solution.fixed_rows::<6>(6 * v).into_owned())).collect();
+        let poses = self
+            .poses
+            .iter()
+            .enumerate()
+            .map(|(v, pose)| moved(pose, &solution.fixed_rows::<6>(6 * v).into_owned()))
+            .collect();
         let mut points = self.points.clone();
         for (point, eliminated) in points.iter_mut().zip(chunks.iter().flat_map(|c| &c.points)) {
             let mut right = -eliminated.gradient;
@@ -344,7 +376,10 @@ impl Problem {
             for d in 0..3 {
                 normal[(d, d)] *= 1.0 + damping;
             }
-            let inverse = normal.try_inverse().filter(|_| coupling.len() >= 2).unwrap_or_else(Matrix3::zeros);
+            let inverse = normal
+                .try_inverse()
+                .filter(|_| coupling.len() >= 2)
+                .unwrap_or_else(Matrix3::zeros);
             for (k, (view, left)) in coupling.iter().enumerate() {
                 let carried = left * inverse;
                 chunk.right[*view] += carried * gradient;
@@ -357,7 +392,11 @@ impl Problem {
                     }
                 }
             }
-            chunk.points.push(EliminatedPoint { inverse, gradient, coupling });
+            chunk.points.push(EliminatedPoint {
+                inverse,
+                gradient,
+                coupling,
+            });
         }
         chunk
     }
@@ -371,7 +410,12 @@ mod tests {
 
     use super::*;
 
-    const CAMERA: Pinhole = Pinhole { fx: 860.0, fy: 858.0, cx: 480.0, cy: 270.0 };
+    const CAMERA: Pinhole = Pinhole {
+        fx: 860.0,
+        fy: 858.0,
+        cx: 480.0,
+        cy: 270.0,
+    };
 
     fn normal(rng: &mut ChaCha8Rng) -> f64 {
         StandardNormal.sample(rng)
@@ -427,22 +471,34 @@ mod tests {
         let pixel = Vector2::new(400.0, 300.0);
         let (_, by_pose, by_point) = linearized(&CAMERA, &pose, &rotation, &point, &pixel).unwrap();
         let residual = |pose: &Isometry3<f64>, point: &Vector3<f64>| {
-            CAMERA.project(&pose.inverse_transform_point(&(*point).into()).coords).unwrap() - pixel
+            CAMERA
+                .project(&pose.inverse_transform_point(&(*point).into()).coords)
+                .unwrap()
+                - pixel
         };
         let h = 1e-6;
         for d in 0..6 {
             let mut twist = Vector6::zeros();
             twist[d] = h;
             let numeric = (residual(&moved(&pose, &twist), &point) - residual(&moved(&pose, &-twist), &point)) / (2.0 * h);
-            assert!((numeric - by_pose.column(d)).norm() < 1e-4 * (1.0 + numeric.norm()), "pose {d}");
+            assert!(
+                (numeric - by_pose.column(d)).norm() < 1e-4 * (1.0 + numeric.norm()),
+                "pose {d}"
+            );
         }
         for d in 0..3 {
             let mut step = Vector3::zeros();
             step[d] = h;
             let numeric = (residual(&pose, &(point + step)) - residual(&pose, &(point - step))) / (2.0 * h);
-            assert!((numeric - by_point.column(d)).norm() < 1e-4 * (1.0 + numeric.norm()), "point {d}");
+            assert!(
+                (numeric - by_point.column(d)).norm() < 1e-4 * (1.0 + numeric.norm()),
+                "point {d}"
+            );
         }
-        let prior = PosePrior { mean: moved(&pose, &noise_twist(&mut rng, 1.0, 0.01)), information: Matrix6::identity() };
+        let prior = PosePrior {
+            mean: moved(&pose, &noise_twist(&mut rng, 1.0, 0.01)),
+            information: Matrix6::identity(),
+        };
         let slope = prior.slope(&pose);
         for d in 0..6 {
             let mut twist = Vector6::zeros();
@@ -461,8 +517,10 @@ mod tests {
         let mut problem = world(&mut rng, 12, 150);
         let truth = problem.clone();
         for view in [0, 6] {
-            problem.priors[view] =
-                Some(PosePrior { mean: truth.poses[view], information: Matrix6::identity() * 1e8 });
+            problem.priors[view] = Some(PosePrior {
+                mean: truth.poses[view],
+                information: Matrix6::identity() * 1e8,
+            });
         }
         for pose in &mut problem.poses {
             *pose = moved(pose, &noise_twist(&mut rng, 0.5, 0.005));
@@ -503,7 +561,10 @@ mod tests {
         let truth = problem.poses.clone();
         problem.observations.iter_mut().for_each(|seen| seen.retain(|o| o.view != 3));
         for (prior, mean) in problem.priors.iter_mut().zip(&truth) {
-            *prior = Some(PosePrior { mean: *mean, information: Matrix6::identity() * 1e4 });
+            *prior = Some(PosePrior {
+                mean: *mean,
+                information: Matrix6::identity() * 1e4,
+            });
         }
         problem.poses[3] = moved(&problem.poses[3], &noise_twist(&mut rng, 2.0, 0.02));
         problem.adjust(20);

@@ -49,7 +49,11 @@ mod tests {
 
     #[test]
     fn weights_are_the_slopes_of_the_costs() {
-        for loss in [RobustLoss::Squared, RobustLoss::Huber { width: 1.5 }, RobustLoss::Cauchy { width: 2.0 }] {
+        for loss in [
+            RobustLoss::Squared,
+            RobustLoss::Huber { width: 1.5 },
+            RobustLoss::Cauchy { width: 2.0 },
+        ] {
             for s in [0.01, 0.7, 2.2, 5.0, 40.0] {
                 let slope = (loss.cost(s + 1e-6) - loss.cost(s - 1e-6)) / 2e-6;
                 assert!((slope - loss.weight(s)).abs() < 1e-5, "{loss:?} at {s}");
