@@ -15,6 +15,7 @@ pub mod quality;
 pub mod recording;
 pub mod robot;
 pub mod sinks;
+pub mod solver;
 pub mod sources;
 pub mod stages;
 pub mod synthetic;
