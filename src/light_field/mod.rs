@@ -1,6 +1,5 @@
 //! The light field: colour as a function of point and direction, held as posed views over a surface (freeform, unstructured).
 
-<<<<<<< HEAD
 pub mod build;
 pub mod colmap;
 pub mod confidence;
@@ -10,18 +9,16 @@ pub mod evaluate;
 pub mod file;
 pub mod photometry;
 pub mod ply;
+pub mod prior;
 pub mod rasterize;
 pub mod renderer;
-pub mod surface;
-pub mod undistort;
-=======
-pub mod prior;
 pub mod reobservation;
 pub mod selection;
+pub mod surface;
 pub mod survey;
 pub mod survey_report;
 pub mod time_offset;
 pub mod tracking;
 pub mod triangulation;
->>>>>>> survey
+pub mod undistort;
 pub mod view;
