@@ -10,3 +10,4 @@ mod media;
 mod pipeline;
 mod support;
 mod temporal_median;
+mod survey;
