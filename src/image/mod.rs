@@ -1,4 +1,8 @@
 //! Images: pixel buffers, their pool, and what is done to pixels without knowing what they show.
 
 pub mod buffer;
+pub mod field_of_view;
 pub mod pool;
+pub mod remap;
+mod remap_bicubic;
+mod remap_bilinear;
