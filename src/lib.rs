@@ -9,5 +9,6 @@ pub mod pipeline;
 pub mod progress;
 pub mod recording;
 pub mod robot;
+pub mod stages;
 pub mod time;
 pub mod yaml;
