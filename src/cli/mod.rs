@@ -2,6 +2,7 @@
 
 pub mod console;
 pub mod context;
+pub mod light_field;
 pub mod outputs;
 pub mod process;
 pub mod report;
@@ -41,6 +42,7 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Process(process::Args),
+    LightField(light_field::Args),
     Simulate(simulate::Args),
 }
 
@@ -90,6 +92,7 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
 fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
         Command::Process(args) => process::run(&args, context),
+        Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
         Command::Simulate(args) => simulate::run(args, context),
     }
 }
