@@ -1,5 +1,7 @@
 //! The `endofield` command.
 
-fn main() -> anyhow::Result<()> {
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
     endofield::cli::main()
 }

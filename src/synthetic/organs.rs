@@ -82,15 +82,16 @@ impl Ground {
         let at = j * self.grid.columns + i;
         let corners = [at, at + 1, at + self.grid.columns, at + self.grid.columns + 1].map(|k| &self.places[k]);
         let weights = [(1.0 - fu) * (1.0 - fv), fu * (1.0 - fv), (1.0 - fu) * fv, fu * fv];
-        let mean = |of: fn(&Place) -> f64| corners.iter().zip(weights).map(|(place, w)| of(place) * w).sum();
-        Place {
-            z: mean(|p| p.z),
-            gall: mean(|p| p.gall),
-            fat: mean(|p| p.fat),
-            coarse: mean(|p| p.coarse),
-            middle: mean(|p| p.middle),
-            wet: mean(|p| p.wet),
+        let mut mean = Place { wet: 0.0, ..FLAT };
+        for (place, weight) in corners.into_iter().zip(weights) {
+            mean.z += place.z * weight;
+            mean.gall += place.gall * weight;
+            mean.fat += place.fat * weight;
+            mean.coarse += place.coarse * weight;
+            mean.middle += place.middle * weight;
+            mean.wet += place.wet * weight;
         }
+        mean
     }
 }
 
