@@ -13,8 +13,10 @@ use crate::synthetic::simulation::{Settings, SimulationError, Storage, simulate}
 
 /// Make recordings of a simulated operation, with exact truth.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  endofield simulate /tmp/operation --scene gall --size 960x540 --frames 100\n\n\
-    writes /tmp/operation/survey and /tmp/operation/live (recordings) and /tmp/operation/truth.")]
+#[command(
+    after_help = "Example:\n  endofield simulate /tmp/operation --scene gall --size 960x540 --frames 100\n\n\
+    writes /tmp/operation/survey and /tmp/operation/live (recordings) and /tmp/operation/truth."
+)]
 pub struct Args {
     /// Folder to make.
     out: PathBuf,
@@ -54,7 +56,7 @@ pub struct Args {
     /// How the arm errs: white noise on its poses (poses.tum), or offsets, backlash and noise of its joints (joints.csv).
     #[arg(long, value_enum, default_value_t = ArmKind::PoseNoise)]
     arm: ArmKind,
-    /// How the pictures are stored: near-lossless H.264, or numbered PNGs.
+    /// How the pictures are stored: near-lossless H.264, or numbered PNGs (always, for --scene calibration).
     #[arg(long, value_enum, default_value_t = VideoKind::Mp4)]
     video: VideoKind,
     /// Standard deviation of the arm's position per axis, mm.
@@ -107,7 +109,12 @@ struct Size {
 }
 
 fn size_from_text(text: &str) -> Result<Size, String> {
-    let parsed = text.split_once('x').and_then(|(w, h)| Some(Size { width: w.parse().ok()?, height: h.parse().ok()? }));
+    let parsed = text.split_once('x').and_then(|(w, h)| {
+        Some(Size {
+            width: w.parse().ok()?,
+            height: h.parse().ok()?,
+        })
+    });
     parsed.ok_or_else(|| format!("expected WIDTHxHEIGHT such as 960x540, found `{text}`"))
 }
 

@@ -42,7 +42,10 @@ impl Default for ArmSettings {
         Self {
             rate_hz: 50.0,
             late_s: 0.040,
-            model: ArmModel::PoseNoise { position_mm: 0.25, rotation_rad: 0.08_f64.to_radians() },
+            model: ArmModel::PoseNoise {
+                position_mm: 0.25,
+                rotation_rad: 0.08_f64.to_radians(),
+            },
             scope_mm: 300.0,
         }
     }
@@ -96,11 +99,20 @@ pub fn arm_readings(
             let hand = world_from_camera(true_s) * camera_from_hand;
             let base_from_hand: Transform<RobotBase, Hand> = Transform::from_isometry(*hand.isometry());
             let stamp_s = true_s + settings.late_s;
-            ArmReading { stamp_s, true_s, base_from_hand, true_base_from_hand: base_from_hand, joints: None }
+            ArmReading {
+                stamp_s,
+                true_s,
+                base_from_hand,
+                true_base_from_hand: base_from_hand,
+                joints: None,
+            }
         })
         .collect();
     match &settings.model {
-        ArmModel::PoseNoise { position_mm, rotation_rad } => {
+        ArmModel::PoseNoise {
+            position_mm,
+            rotation_rad,
+        } => {
             let mut random = ChaCha8Rng::seed_from_u64(seed);
             // A normal distribution of a finite deviation always exists.
             let mut deviate = |sigma: f64| Normal::new(0.0, sigma).map_or(0.0, |normal| normal.sample(&mut random));

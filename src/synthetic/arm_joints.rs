@@ -125,8 +125,23 @@ mod tests {
         let hands: Vec<_> = (0..50)
             .map(|i| {
                 let s = f64::from(i) * 0.06;
-                middle.perturbed_left(&Vector6::new(30.0 * s.sin(), 25.0 * (1.3 * s).sin(), 20.0 * s.sin(), 0.0, 0.0, 0.0))
-                    .perturbed_right(&Vector6::new(0.0, 0.0, 0.0, 0.2 * s.sin(), 0.2 * (0.7 * s).sin(), 0.1 * s.sin()))
+                middle
+                    .perturbed_left(&Vector6::new(
+                        30.0 * s.sin(),
+                        25.0 * (1.3 * s).sin(),
+                        20.0 * s.sin(),
+                        0.0,
+                        0.0,
+                        0.0,
+                    ))
+                    .perturbed_right(&Vector6::new(
+                        0.0,
+                        0.0,
+                        0.0,
+                        0.2 * s.sin(),
+                        0.2 * (0.7 * s).sin(),
+                        0.1 * s.sin(),
+                    ))
             })
             .collect();
         let path = joint_path(&arm, &AT_WORK, &hands).unwrap();
@@ -139,11 +154,24 @@ mod tests {
     #[test]
     fn encoders_err_within_their_bounds_and_lag_where_they_turn() {
         let arm = Arm::aesop_3000().unwrap();
-        let errors = JointErrors { noise_mm: 0.0, noise_rad: 0.0, offset_mm: 0.0, offset_rad: 0.0, ..JointErrors::default() };
-        let path: Vec<Vec<f64>> = (0..200).map(|i| AT_WORK.iter().map(|q| q + 0.3 * (f64::from(i) * 0.05).sin()).collect()).collect();
+        let errors = JointErrors {
+            noise_mm: 0.0,
+            noise_rad: 0.0,
+            offset_mm: 0.0,
+            offset_rad: 0.0,
+            ..JointErrors::default()
+        };
+        let path: Vec<Vec<f64>> = (0..200)
+            .map(|i| AT_WORK.iter().map(|q| q + 0.3 * (f64::from(i) * 0.05).sin()).collect())
+            .collect();
         let readings = encoder_readings(&arm, &errors, 1, &path);
         let lag = |i: usize| readings[i][0] - path[i][0];
         // Rising: the reading is behind by half the play; falling: ahead.
-        assert!((lag(20) + 0.04).abs() < 1e-9 && (lag(60) - 0.04).abs() < 1e-9, "{} {}", lag(20), lag(60));
+        assert!(
+            (lag(20) + 0.04).abs() < 1e-9 && (lag(60) - 0.04).abs() < 1e-9,
+            "{} {}",
+            lag(20),
+            lag(60)
+        );
     }
 }

@@ -29,9 +29,27 @@ pub fn simulate_boards(out: &Path, settings: &Settings, progress: &dyn Progress)
     let still = move |_: f64| at_rest;
     let carried = move |seconds: f64| world_from_board * station(seconds);
     let mut summary = Summary::default();
-    summary.frames += write_board_recording(out, "survey", settings.survey_frames, settings, renderer, progress, &still, &waved)?;
+    summary.frames += write_board_recording(
+        out,
+        "survey",
+        settings.survey_frames,
+        settings,
+        renderer,
+        progress,
+        &still,
+        &waved,
+    )?;
     let seen = move |seconds: f64| station(seconds).inverse();
-    summary.frames += write_board_recording(out, "live", settings.live_frames, settings, renderer, progress, &carried, &seen)?;
+    summary.frames += write_board_recording(
+        out,
+        "live",
+        settings.live_frames,
+        settings,
+        renderer,
+        progress,
+        &carried,
+        &seen,
+    )?;
     let truth = json!({
         "unit": "mm",
         "seed": settings.seed,
@@ -48,7 +66,10 @@ pub fn simulate_boards(out: &Path, settings: &Settings, progress: &dyn Progress)
     Ok(summary)
 }
 
-#[expect(clippy::too_many_arguments, reason = "one recording is these things; a struct for one call would only rename them")]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "one recording is these things; a struct for one call would only rename them"
+)]
 fn write_board_recording(
     out: &Path,
     name: &str,
@@ -67,13 +88,23 @@ fn write_board_recording(
     make_folder(&truth)?;
     let seconds = |frame: usize| frame as f64 / settings.frame_rate_hz;
     let seed = hash_u64(settings.seed ^ hash_u64(name.len() as u64));
-    let readings = arm_readings(&settings.arm, seed, -POSE_MARGIN_S, seconds(frames) + POSE_MARGIN_S, world_from_camera)?;
+    let readings = arm_readings(
+        &settings.arm,
+        seed,
+        -POSE_MARGIN_S,
+        seconds(frames) + POSE_MARGIN_S,
+        world_from_camera,
+    )?;
     let mut stamps = String::from("frame,timestamp_s\n");
     let mut found = String::from("frame,corner,x_px,y_px,board_x_mm,board_y_mm\n");
     for frame in 0..frames {
         // Writing to a String cannot fail.
         let _infallible = writeln!(stamps, "{frame},{:.6}", seconds(frame));
-        for (number, corner) in corners(renderer, &camera_from_board(seconds(frame))).unwrap_or_default().iter().enumerate() {
+        for (number, corner) in corners(renderer, &camera_from_board(seconds(frame)))
+            .unwrap_or_default()
+            .iter()
+            .enumerate()
+        {
             let _infallible = writeln!(
                 found,
                 "{frame},{number},{:.5},{:.5},{},{}",

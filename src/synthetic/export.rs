@@ -52,12 +52,18 @@ pub enum ExportError {
 
 /// Make a folder and its parents.
 pub fn make_folder(path: &Path) -> Result<(), ExportError> {
-    fs::create_dir_all(path).map_err(|source| ExportError::Io { path: path.to_owned(), source })
+    fs::create_dir_all(path).map_err(|source| ExportError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Write a text file.
 pub fn write_text(path: &Path, text: &str) -> Result<(), ExportError> {
-    fs::write(path, text).map_err(|source| ExportError::Io { path: path.to_owned(), source })
+    fs::write(path, text).map_err(|source| ExportError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Write an 8-bit color PNG, fast.
@@ -80,8 +86,14 @@ fn write_png(path: &Path, bytes: &[u8], size: (usize, usize), color: image::Exte
     let mut file = Vec::with_capacity(bytes.len() / 2);
     PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Up)
         .write_image(bytes, size.0 as u32, size.1 as u32, color)
-        .map_err(|source| ExportError::Encode { path: path.to_owned(), source })?;
-    fs::write(path, file).map_err(|source| ExportError::Io { path: path.to_owned(), source })
+        .map_err(|source| ExportError::Encode {
+            path: path.to_owned(),
+            source,
+        })?;
+    fs::write(path, file).map_err(|source| ExportError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Write poses, mm; `transform` as in `T_base_hand`.
@@ -90,17 +102,25 @@ pub fn write_poses<To, From>(
     transform: &str,
     poses: impl Iterator<Item = (f64, Transform<To, From>)>,
 ) -> Result<(), ExportError> {
-    Ok(write_tum(path, transform, poses.map(|(s, pose)| (Timestamp::from_seconds(s), *pose.isometry())))?)
+    Ok(write_tum(
+        path,
+        transform,
+        poses.map(|(s, pose)| (Timestamp::from_seconds(s), *pose.isometry())),
+    )?)
 }
 
 /// Write what the arm said: `joints.csv` where it is a chain of joints, else `poses.tum`.
 pub fn write_arm(folder: &Path, readings: &[ArmReading]) -> Result<(), ExportError> {
-    let joints = joints_text(readings, |reading| Some((reading.stamp_s, reading.joints.as_ref()?.read.as_slice())));
+    let joints = joints_text(readings, |reading| {
+        Some((reading.stamp_s, reading.joints.as_ref()?.read.as_slice()))
+    });
     match joints {
         Some(text) => write_text(&folder.join("joints.csv"), &text),
-        None => {
-            write_poses(&folder.join("poses.tum"), "T_base_hand", readings.iter().map(|r| (r.stamp_s, r.base_from_hand)))
-        }
+        None => write_poses(
+            &folder.join("poses.tum"),
+            "T_base_hand",
+            readings.iter().map(|r| (r.stamp_s, r.base_from_hand)),
+        ),
     }
 }
 
@@ -108,7 +128,9 @@ pub fn write_arm(folder: &Path, readings: &[ArmReading]) -> Result<(), ExportErr
 pub fn write_true_arm(folder: &Path, readings: &[ArmReading]) -> Result<(), ExportError> {
     let hands = readings.iter().map(|r| (r.true_s, r.true_base_from_hand));
     write_poses(&folder.join("hand_poses.tum"), "T_base_hand", hands)?;
-    match joints_text(readings, |reading| Some((reading.true_s, reading.joints.as_ref()?.exact.as_slice()))) {
+    match joints_text(readings, |reading| {
+        Some((reading.true_s, reading.joints.as_ref()?.exact.as_slice()))
+    }) {
         Some(text) => write_text(&folder.join("joints.csv"), &text),
         None => Ok(()),
     }

@@ -47,7 +47,14 @@ struct Place {
     wet: f64,
 }
 
-const FLAT: Place = Place { z: 0.0, gall: 0.0, fat: 0.0, coarse: 0.0, middle: 0.0, wet: 1.0 };
+const FLAT: Place = Place {
+    z: 0.0,
+    gall: 0.0,
+    fat: 0.0,
+    coarse: 0.0,
+    middle: 0.0,
+    wet: 1.0,
+};
 
 /// Places on the relief's grid, read bilinearly.
 struct Ground {
@@ -98,10 +105,12 @@ impl Ground {
 impl Organs {
     /// Grow the organs of `seed`; `texel_mm` is the finest detail of the texture.
     pub fn new(anatomy: Anatomy, seed: u64, texel_mm: f64) -> Self {
-        let shape = Shape { anatomy, noise: Noise::new(seed ^ 0x5157) };
+        let shape = Shape {
+            anatomy,
+            noise: Noise::new(seed ^ 0x5157),
+        };
         let (tissue, film) = (Noise::new(seed ^ 0x7155), Noise::new(seed ^ 0xF11F));
-        let relief =
-            Relief::from_function(HALF_WIDTH_MM, HALF_HEIGHT_MM, RELIEF_PITCH_MM, |x, y| shape.at(x, y).z);
+        let relief = Relief::from_function(HALF_WIDTH_MM, HALF_HEIGHT_MM, RELIEF_PITCH_MM, |x, y| shape.at(x, y).z);
         let ground = Ground::new(&shape, tissue, film);
         let grid = MaterialGrid::new(HALF_WIDTH_MM, HALF_HEIGHT_MM, texel_mm);
         let vessels = vessel_coverage(&grid, roots(anatomy), seed ^ 0x7E55);
@@ -125,26 +134,116 @@ impl Organs {
 
 fn roots(anatomy: Anatomy) -> &'static [Root] {
     const GALL: &[Root] = &[
-        Root { at: [33.0, 18.0], heading: 3.5, radius_mm: 0.42, length_mm: 11.0 },
-        Root { at: [26.0, 8.0], heading: 3.3, radius_mm: 0.38, length_mm: 10.0 },
-        Root { at: [10.0, 17.0], heading: 3.9, radius_mm: 0.33, length_mm: 8.0 },
-        Root { at: [2.0, -6.0], heading: 2.4, radius_mm: 0.30, length_mm: 7.0 },
-        Root { at: [-12.0, -17.0], heading: 2.2, radius_mm: 0.33, length_mm: 8.0 },
-        Root { at: [-36.0, 2.0], heading: 5.6, radius_mm: 0.30, length_mm: 7.0 },
-        Root { at: [-16.0, 10.0], heading: 4.4, radius_mm: 0.27, length_mm: 6.0 },
-        Root { at: [14.0, 2.0], heading: 1.4, radius_mm: 0.25, length_mm: 6.0 },
-        Root { at: [45.0, -40.0], heading: 2.4, radius_mm: 0.6, length_mm: 14.0 },
-        Root { at: [15.0, -48.0], heading: 1.2, radius_mm: 0.5, length_mm: 12.0 },
-        Root { at: [-60.0, 45.0], heading: 5.6, radius_mm: 0.5, length_mm: 15.0 },
-        Root { at: [10.0, 60.0], heading: 4.4, radius_mm: 0.5, length_mm: 15.0 },
-        Root { at: [-55.0, -45.0], heading: 0.7, radius_mm: 0.45, length_mm: 13.0 },
+        Root {
+            at: [33.0, 18.0],
+            heading: 3.5,
+            radius_mm: 0.42,
+            length_mm: 11.0,
+        },
+        Root {
+            at: [26.0, 8.0],
+            heading: 3.3,
+            radius_mm: 0.38,
+            length_mm: 10.0,
+        },
+        Root {
+            at: [10.0, 17.0],
+            heading: 3.9,
+            radius_mm: 0.33,
+            length_mm: 8.0,
+        },
+        Root {
+            at: [2.0, -6.0],
+            heading: 2.4,
+            radius_mm: 0.30,
+            length_mm: 7.0,
+        },
+        Root {
+            at: [-12.0, -17.0],
+            heading: 2.2,
+            radius_mm: 0.33,
+            length_mm: 8.0,
+        },
+        Root {
+            at: [-36.0, 2.0],
+            heading: 5.6,
+            radius_mm: 0.30,
+            length_mm: 7.0,
+        },
+        Root {
+            at: [-16.0, 10.0],
+            heading: 4.4,
+            radius_mm: 0.27,
+            length_mm: 6.0,
+        },
+        Root {
+            at: [14.0, 2.0],
+            heading: 1.4,
+            radius_mm: 0.25,
+            length_mm: 6.0,
+        },
+        Root {
+            at: [45.0, -40.0],
+            heading: 2.4,
+            radius_mm: 0.6,
+            length_mm: 14.0,
+        },
+        Root {
+            at: [15.0, -48.0],
+            heading: 1.2,
+            radius_mm: 0.5,
+            length_mm: 12.0,
+        },
+        Root {
+            at: [-60.0, 45.0],
+            heading: 5.6,
+            radius_mm: 0.5,
+            length_mm: 15.0,
+        },
+        Root {
+            at: [10.0, 60.0],
+            heading: 4.4,
+            radius_mm: 0.5,
+            length_mm: 15.0,
+        },
+        Root {
+            at: [-55.0, -45.0],
+            heading: 0.7,
+            radius_mm: 0.45,
+            length_mm: 13.0,
+        },
     ];
     const LIVER: &[Root] = &[
-        Root { at: [-60.0, 20.0], heading: 0.1, radius_mm: 0.6, length_mm: 16.0 },
-        Root { at: [50.0, -40.0], heading: 2.3, radius_mm: 0.55, length_mm: 15.0 },
-        Root { at: [10.0, 50.0], heading: 4.5, radius_mm: 0.5, length_mm: 14.0 },
-        Root { at: [-20.0, -50.0], heading: 1.4, radius_mm: 0.5, length_mm: 14.0 },
-        Root { at: [60.0, 25.0], heading: 3.3, radius_mm: 0.45, length_mm: 12.0 },
+        Root {
+            at: [-60.0, 20.0],
+            heading: 0.1,
+            radius_mm: 0.6,
+            length_mm: 16.0,
+        },
+        Root {
+            at: [50.0, -40.0],
+            heading: 2.3,
+            radius_mm: 0.55,
+            length_mm: 15.0,
+        },
+        Root {
+            at: [10.0, 50.0],
+            heading: 4.5,
+            radius_mm: 0.5,
+            length_mm: 14.0,
+        },
+        Root {
+            at: [-20.0, -50.0],
+            heading: 1.4,
+            radius_mm: 0.5,
+            length_mm: 14.0,
+        },
+        Root {
+            at: [60.0, 25.0],
+            heading: 3.3,
+            radius_mm: 0.45,
+            length_mm: 12.0,
+        },
     ];
     match anatomy {
         Anatomy::GallBladder => GALL,
@@ -166,19 +265,28 @@ impl Shape {
                 // The bed falls away towards the lower right, where the fat of the omentum lies.
                 let edge = smooth_step((-y - 0.55 * x - 16.0 + 6.0 * self.noise.at(flat / 16.0)) / 9.0);
                 let liver = swell - 0.0016 * (x * x + y * y) - 13.0 * edge;
-                let lobules = 1.7 * (1.0 - (self.noise.at(flat / 6.5).powi(2) + 0.02).sqrt() * 2.2) + self.noise.octaves(flat / 3.1, 2) * 0.35;
+                let lobules = 1.7 * (1.0 - (self.noise.at(flat / 6.5).powi(2) + 0.02).sqrt() * 2.2)
+                    + self.noise.octaves(flat / 3.1, 2) * 0.35;
                 let fat = -7.5 + 0.6 * swell + lobules;
                 let bed = smooth_max(liver, fat, 1.6);
                 let gall_z = self.gall_bladder(x, y);
                 let z = smooth_max(bed, gall_z, 1.2);
-                Place { z, gall: smooth_step((gall_z - bed + 0.25) / 1.1), fat: smooth_step((fat - liver) / 1.4 + 0.5), ..FLAT }
+                Place {
+                    z,
+                    gall: smooth_step((gall_z - bed + 0.25) / 1.1),
+                    fat: smooth_step((fat - liver) / 1.4 + 0.5),
+                    ..FLAT
+                }
             }
             Anatomy::Liver => {
                 // Two lobes with a fissure between them.
                 let along = x * 0.42 + y * 0.91 + 4.0 * self.noise.at(flat / 25.0) - 6.0;
                 let left = 4.0 - 0.010 * (along - 26.0) * (along - 26.0);
                 let right = 6.0 - 0.007 * (along + 30.0) * (along + 30.0);
-                Place { z: smooth_max(left, right, 1.5).max(-25.0) + swell, ..FLAT }
+                Place {
+                    z: smooth_max(left, right, 1.5).max(-25.0) + swell,
+                    ..FLAT
+                }
             }
         }
     }
@@ -199,7 +307,11 @@ impl Shape {
         // An ellipsoid's wall down to where it would hang over, then on at that slope.
         const STEEPEST_Q: f64 = 0.93;
         let rim = (1.0 - STEEPEST_Q * STEEPEST_Q).sqrt();
-        let wall = if q < STEEPEST_Q { (1.0 - q * q).sqrt() } else { rim - (q - STEEPEST_Q) * STEEPEST_Q / rim };
+        let wall = if q < STEEPEST_Q {
+            (1.0 - q * q).sqrt()
+        } else {
+            rim - (q - STEEPEST_Q) * STEEPEST_Q / rim
+        };
         centre + 0.95 * radius * wall + 0.25 * bulge
     }
 }
@@ -225,13 +337,25 @@ impl Paint {
         colour = mixed(colour, LIVER_NET, 0.16 * lobules + 0.14 * speck);
 
         // Fat: yellow lobules, redder between them.
-        let fat = mixed(scaled(FAT, 1.0 + 0.18 * middle + 0.14 * fine), FAT_RED, (0.35 - 0.7 * coarse + 0.3 * middle).clamp(0.0, 0.8));
+        let fat = mixed(
+            scaled(FAT, 1.0 + 0.18 * middle + 0.14 * fine),
+            FAT_RED,
+            (0.35 - 0.7 * coarse + 0.3 * middle).clamp(0.0, 0.8),
+        );
         colour = mixed(colour, fat, place.fat);
 
         // Gall bladder: bile shimmers green and yellow through a pale, veined wall.
         let bile = smooth_step(0.5 + 0.9 * coarse + 0.012 * x);
-        let wall = mixed(mixed(GALL_PALE, GALL_GREEN, bile), GALL_PINK, (0.30 + 0.55 * middle + 0.2 * coarse).clamp(0.0, 0.85));
-        colour = mixed(colour, scaled(wall, 1.0 + 0.08 * middle + 0.13 * fine - 0.12 * speck), place.gall);
+        let wall = mixed(
+            mixed(GALL_PALE, GALL_GREEN, bile),
+            GALL_PINK,
+            (0.30 + 0.55 * middle + 0.2 * coarse).clamp(0.0, 0.85),
+        );
+        colour = mixed(
+            colour,
+            scaled(wall, 1.0 + 0.08 * middle + 0.13 * fine - 0.12 * speck),
+            place.gall,
+        );
 
         // Capillaries everywhere, faint; vessels over them.
         let net = (1.0 - self.tissue.octaves(p / 2.1 + Vector3::repeat(23.0), 2).abs() * 9.0).max(0.0);
@@ -239,7 +363,11 @@ impl Paint {
         let depth = if place.gall > 0.5 || place.fat > 0.5 { 0.72 } else { 0.5 };
         colour = mixed(colour, VESSEL, depth * vessel);
 
-        Texel { albedo: colour.map(|c| c.clamp(0.003, 0.9) as f32), gloss: place.wet as f32, film: [0.0; 2] }
+        Texel {
+            albedo: colour.map(|c| c.clamp(0.003, 0.9) as f32),
+            gloss: place.wet as f32,
+            film: [0.0; 2],
+        }
     }
 
     /// Height of the film above the tissue, mm.

@@ -46,7 +46,12 @@ pub struct Height {
 
 impl Relief {
     /// Sample `height` over ±`half_width_mm` × ±`half_height_mm` around the origin.
-    pub fn from_function(half_width_mm: f64, half_height_mm: f64, pitch_mm: f64, height: impl Fn(f64, f64) -> f64 + Sync) -> Self {
+    pub fn from_function(
+        half_width_mm: f64,
+        half_height_mm: f64,
+        pitch_mm: f64,
+        height: impl Fn(f64, f64) -> f64 + Sync,
+    ) -> Self {
         use rayon::prelude::*;
         let columns = (2.0 * half_width_mm / pitch_mm).ceil() as usize + 3;
         let rows = (2.0 * half_height_mm / pitch_mm).ceil() as usize + 3;
@@ -103,7 +108,11 @@ impl Relief {
             dy += dv[k] * along;
             dx += wv[k] * (a * du[0] + b * du[1] + c * du[2]);
         }
-        Height { z, dx: dx / self.pitch_mm, dy: dy / self.pitch_mm }
+        Height {
+            z,
+            dx: dx / self.pitch_mm,
+            dy: dy / self.pitch_mm,
+        }
     }
 
     /// Where the ray `origin + t·direction` first meets the surface from above; t in units of `direction`.
@@ -119,7 +128,11 @@ impl Relief {
             let height = self.height(p.x, p.y);
             let gap = p.z - height.z;
             if gap < 2e-3 {
-                let grazing = ReliefHit { t, dx: height.dx, dy: height.dy };
+                let grazing = ReliefHit {
+                    t,
+                    dx: height.dx,
+                    dy: height.dy,
+                };
                 return self.polished_hit(origin, direction, t).or(Some(grazing));
             }
             t += gap / closing_speed;
@@ -145,7 +158,11 @@ impl Relief {
             let step = (p.z - height.z) / closing_speed;
             t += step;
             if step.abs() < SETTLED_MM {
-                return Some(ReliefHit { t, dx: height.dx, dy: height.dy });
+                return Some(ReliefHit {
+                    t,
+                    dx: height.dx,
+                    dy: height.dy,
+                });
             }
         }
         None

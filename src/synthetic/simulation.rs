@@ -13,7 +13,8 @@ use crate::robot::kinematics::ArmError;
 use crate::synthetic::airborne::Smoke;
 use crate::synthetic::arm::{ArmModel, ArmReading, ArmSettings, arm_readings, world_from_camera_at_work};
 use crate::synthetic::export::{
-    ExportError, make_folder, write_arm, write_camera, write_hand_eye, write_mask, write_poses, write_rgb, write_text, write_true_arm, write_u16,
+    ExportError, make_folder, write_arm, write_camera, write_hand_eye, write_mask, write_poses, write_rgb, write_text,
+    write_true_arm, write_u16,
 };
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::organs::Anatomy;
@@ -159,7 +160,13 @@ pub fn simulate(out: &Path, settings: &Settings, progress: &dyn Progress) -> Res
     let renderer = renderer_of(settings)?;
     let mut plans = Vec::new();
     if settings.survey_frames > 0 {
-        plans.push(planned("survey", Course::Survey, settings.survey_frames, settings, &renderer)?);
+        plans.push(planned(
+            "survey",
+            Course::Survey,
+            settings.survey_frames,
+            settings,
+            &renderer,
+        )?);
     }
     if settings.live_frames > 0 {
         plans.push(planned("live", Course::Live, settings.live_frames, settings, &renderer)?);
@@ -192,12 +199,20 @@ pub(super) fn renderer_of(settings: &Settings) -> Result<Renderer, SimulationErr
     Ok(Renderer::new(world, camera, settings.field_radius, settings.noise))
 }
 
-fn planned(name: &'static str, course: Course, frames: usize, settings: &Settings, renderer: &Renderer) -> Result<Plan, SimulationError> {
+fn planned(
+    name: &'static str,
+    course: Course,
+    frames: usize,
+    settings: &Settings,
+    renderer: &Renderer,
+) -> Result<Plan, SimulationError> {
     let duration_s = frames as f64 / settings.frame_rate_hz;
     let trajectory = Trajectory::new(course, duration_s, renderer.world().world_from_organs);
     let times: Vec<f64> = (0..frames).map(|frame| frame as f64 / settings.frame_rate_hz).collect();
-    let metered: Vec<Vec<f32>> =
-        times.par_iter().map(|&t| renderer.metered(t, trajectory.world_from_camera(t))).collect();
+    let metered: Vec<Vec<f32>> = times
+        .par_iter()
+        .map(|&t| renderer.metered(t, trajectory.world_from_camera(t)))
+        .collect();
     let exposures = AutoExposure::default().exposures(&metered, renderer.sensor());
     // The survey's noise is not the live recording's.
     let seed = hash_u64(settings.seed ^ hash_u64(name.len() as u64));
@@ -282,11 +297,20 @@ fn render_recording(
                 let rendered = renderer.render(shot, true);
                 write_truth(&truth, shot.frame, &rendered)?;
                 let figures = measured(&rendered);
-                Ok((Rendered { truth: None, without_particles: None, ..rendered }, figures))
+                Ok((
+                    Rendered {
+                        truth: None,
+                        without_particles: None,
+                        ..rendered
+                    },
+                    figures,
+                ))
             })
             .collect::<Result<_, ExportError>>()?;
         for (shot, (rendered, [specular, level])) in batch.iter().zip(&rendered) {
-            video.write(&rendered.video, Timestamp::from_seconds(shot.seconds)).map_err(ExportError::from)?;
+            video
+                .write(&rendered.video, Timestamp::from_seconds(shot.seconds))
+                .map_err(ExportError::from)?;
             summary.specular_share += specular;
             summary.mean_level += level;
             summary.frames += 1;
@@ -392,7 +416,10 @@ fn truth_json(settings: &Settings, plans: &[Plan], summary: &Summary) -> String 
 
 fn arm_json(arm: &ArmSettings) -> serde_json::Value {
     match &arm.model {
-        ArmModel::PoseNoise { position_mm, rotation_rad } => json!({
+        ArmModel::PoseNoise {
+            position_mm,
+            rotation_rad,
+        } => json!({
             "rate_hz": arm.rate_hz,
             "position_noise_mm": position_mm,
             "rotation_noise_rad": rotation_rad,
