@@ -1,3 +1,7 @@
 //! The integration tests, one binary.
 
 mod architecture;
+mod camera;
+mod recording;
+mod robot;
+mod undistortion;
