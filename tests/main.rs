@@ -5,3 +5,4 @@ mod camera;
 mod recording;
 mod robot;
 mod undistortion;
+mod media;
