@@ -13,5 +13,6 @@ pub mod robot;
 pub mod stages;
 pub mod sinks;
 pub mod sources;
+pub mod stages;
 pub mod time;
 pub mod yaml;

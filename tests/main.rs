@@ -6,3 +6,5 @@ mod recording;
 mod robot;
 mod undistortion;
 mod media;
+mod color;
+mod temporal_median;

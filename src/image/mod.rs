@@ -6,3 +6,6 @@ pub mod pool;
 pub mod remap;
 mod remap_bicubic;
 mod remap_bilinear;
+pub mod color;
+pub mod pool;
+pub mod wide;
