@@ -18,7 +18,6 @@ pub mod stages;
 pub mod sinks;
 pub mod solver;
 pub mod sources;
-pub mod stages;
 pub mod synthetic;
 pub mod time;
 pub mod yaml;

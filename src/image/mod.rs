@@ -10,6 +10,5 @@ pub mod color;
 pub mod corners;
 pub mod gradient;
 pub mod patch;
-pub mod pool;
 pub mod pyramid;
 pub mod wide;
