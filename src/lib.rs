@@ -14,7 +14,6 @@ pub mod progress;
 pub mod quality;
 pub mod recording;
 pub mod robot;
-pub mod stages;
 pub mod sinks;
 pub mod solver;
 pub mod sources;
