@@ -5,6 +5,8 @@ pub mod frame;
 pub mod geometry;
 pub mod image;
 pub mod light_field;
+pub mod localization;
 pub mod pipeline;
 pub mod progress;
+pub mod stages;
 pub mod time;

@@ -29,11 +29,19 @@ pub fn box_blur(image: &mut Image<f32>, radius: usize, scratch: &mut BlurScratch
     for y in 0..height {
         if y + radius < height {
             let entering = y + radius;
-            add_row(&mut scratch.sums, &scratch.plane[entering * width..(entering + 1) * width], 1.0);
+            add_row(
+                &mut scratch.sums,
+                &scratch.plane[entering * width..(entering + 1) * width],
+                1.0,
+            );
         }
         if y > radius {
             let leaving = y - radius - 1;
-            add_row(&mut scratch.sums, &scratch.plane[leaving * width..(leaving + 1) * width], -1.0);
+            add_row(
+                &mut scratch.sums,
+                &scratch.plane[leaving * width..(leaving + 1) * width],
+                -1.0,
+            );
         }
         let rows = (y + radius).min(height - 1) + 1 - y.saturating_sub(radius);
         let scale = 1.0 / rows as f32;

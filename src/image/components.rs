@@ -88,12 +88,22 @@ impl Components {
     fn collect_runs(&mut self, row: &[u8], y: u32) {
         let mut x = 0;
         while x < row.len() {
-            let Some(gap) = row[x..].iter().position(|&v| v != 0) else { break };
+            let Some(gap) = row[x..].iter().position(|&v| v != 0) else {
+                break;
+            };
             let begin = x + gap;
-            let end = row[begin..].iter().position(|&v| v == 0).map_or(row.len(), |length| begin + length);
+            let end = row[begin..]
+                .iter()
+                .position(|&v| v == 0)
+                .map_or(row.len(), |length| begin + length);
             let label = self.parents.len() as u32;
             self.parents.push(label);
-            self.runs.push(Run { y, begin: begin as u32, end: end as u32, label });
+            self.runs.push(Run {
+                y,
+                begin: begin as u32,
+                end: end as u32,
+                label,
+            });
             x = end;
         }
     }
@@ -122,7 +132,13 @@ impl Components {
             let root = self.root(run.label) as usize;
             if self.numbers[root] == u32::MAX {
                 self.numbers[root] = self.regions.len() as u32;
-                self.regions.push(Region { area: 0, left: run.begin, top: run.y, right: run.end, bottom: run.y + 1 });
+                self.regions.push(Region {
+                    area: 0,
+                    left: run.begin,
+                    top: run.y,
+                    right: run.end,
+                    bottom: run.y + 1,
+                });
             }
             let number = self.numbers[root];
             let region = &mut self.regions[number as usize];
@@ -140,7 +156,10 @@ mod tests {
     use super::*;
 
     fn mask(rows: &[&str]) -> Mask {
-        let pixels = rows.iter().flat_map(|r| r.bytes().map(|b| if b == b'#' { 255 } else { 0 })).collect();
+        let pixels = rows
+            .iter()
+            .flat_map(|r| r.bytes().map(|b| if b == b'#' { 255 } else { 0 }))
+            .collect();
         Image::from_vec(rows[0].len(), rows.len(), pixels).unwrap()
     }
 
@@ -156,7 +175,9 @@ mod tests {
 
     #[test]
     fn every_set_pixel_lies_in_one_region() {
-        let pixels: Vec<u8> = (0..64 * 48).map(|i| if (i * 2654435761_usize >> 7) % 3 == 0 { 255 } else { 0 }).collect();
+        let pixels: Vec<u8> = (0..64 * 48)
+            .map(|i| if (i * 2654435761_usize >> 7) % 3 == 0 { 255 } else { 0 })
+            .collect();
         let noisy = Image::from_vec(64, 48, pixels).unwrap();
         let mut components = Components::default();
         components.label(&noisy);

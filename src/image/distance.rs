@@ -66,7 +66,10 @@ mod tests {
                     .map(|&(u, v): &(f64, f64)| (x as f64 - u).hypot(y as f64 - v))
                     .fold(f64::MAX, f64::min);
                 let found = f64::from(out.at(x, y)) / f64::from(UNITS_PER_PX);
-                assert!((found - euclid).abs() <= 0.081 * euclid + 1e-9, "({x}, {y}): {found} against {euclid}");
+                assert!(
+                    (found - euclid).abs() <= 0.081 * euclid + 1e-9,
+                    "({x}, {y}): {found} against {euclid}"
+                );
             }
         }
     }

@@ -168,33 +168,40 @@ impl SpecularityDetector {
             self.cells.resize(width, height, Cell::default());
         }
         let scale = 1.0 / (step * step) as f32;
-        self.cells.pixels_mut().par_chunks_mut(width).enumerate().for_each(|(y, cells)| {
-            cells.fill(Cell { valid: true, ..Cell::default() });
-            for v in y * step..(y + 1) * step {
-                for (cell, pixels) in cells.iter_mut().zip(image.row(v).chunks_exact(step)) {
-                    let (mut least, mut most, mut rgb) = (0_u32, 0_u32, [0_u32; 3]);
-                    for &[r, g, b] in pixels {
-                        least += u32::from(r.min(g).min(b));
-                        most += u32::from(r.max(g).max(b));
-                        rgb = [rgb[0] + u32::from(r), rgb[1] + u32::from(g), rgb[2] + u32::from(b)];
+        self.cells
+            .pixels_mut()
+            .par_chunks_mut(width)
+            .enumerate()
+            .for_each(|(y, cells)| {
+                cells.fill(Cell {
+                    valid: true,
+                    ..Cell::default()
+                });
+                for v in y * step..(y + 1) * step {
+                    for (cell, pixels) in cells.iter_mut().zip(image.row(v).chunks_exact(step)) {
+                        let (mut least, mut most, mut rgb) = (0_u32, 0_u32, [0_u32; 3]);
+                        for &[r, g, b] in pixels {
+                            least += u32::from(r.min(g).min(b));
+                            most += u32::from(r.max(g).max(b));
+                            rgb = [rgb[0] + u32::from(r), rgb[1] + u32::from(g), rgb[2] + u32::from(b)];
+                        }
+                        cell.least += least as f32 * scale;
+                        cell.most += most as f32 * scale;
+                        for (mean, sum) in cell.rgb.iter_mut().zip(rgb) {
+                            *mean += sum as f32 * scale;
+                        }
                     }
-                    cell.least += least as f32 * scale;
-                    cell.most += most as f32 * scale;
-                    for (mean, sum) in cell.rgb.iter_mut().zip(rgb) {
-                        *mean += sum as f32 * scale;
+                    if let Some(field) = field {
+                        for (cell, inside) in cells.iter_mut().zip(field.row(v).chunks_exact(step)) {
+                            cell.valid &= inside.iter().all(|&p| p != 0);
+                        }
                     }
                 }
-                if let Some(field) = field {
-                    for (cell, inside) in cells.iter_mut().zip(field.row(v).chunks_exact(step)) {
-                        cell.valid &= inside.iter().all(|&p| p != 0);
-                    }
+                for cell in cells {
+                    // What is all but black tells nothing about tissue (surround, shadow).
+                    cell.valid &= cell.most > 12.0;
                 }
-            }
-            for cell in cells {
-                // What is all but black tells nothing about tissue (surround, shadow).
-                cell.valid &= cell.most > 12.0;
-            }
-        });
+            });
         self.brightness = brightness_of(self.cells.pixels());
     }
 
@@ -213,26 +220,56 @@ impl SpecularityDetector {
             for ((weight, cell), (mean, free)) in self.weight.pixels_mut().iter_mut().zip(self.cells.pixels()).zip(means) {
                 let known = cell.valid && free;
                 // What stands out keeps a little say, so that a wide bright area is still its own background.
-                *weight = if !known { 0.0 } else if cell.least - mean < limit { 1.0 } else { 0.02 };
+                *weight = if !known {
+                    0.0
+                } else if cell.least - mean < limit {
+                    1.0
+                } else {
+                    0.02
+                };
             }
         }
         self.blur_backgrounds(sigma);
         // Mean absolute deviation of the unexceptional cells.
         let means = &self.least_background;
-        fill_from(&mut self.spread, &self.cells, |index, cell| (cell.least - means.pixels()[index]).abs());
-        weighted_mean(&mut self.spread, &self.weight, sigma, &mut self.blurred_weight, &mut self.scratch);
+        fill_from(&mut self.spread, &self.cells, |index, cell| {
+            (cell.least - means.pixels()[index]).abs()
+        });
+        weighted_mean(
+            &mut self.spread,
+            &self.weight,
+            sigma,
+            &mut self.blurred_weight,
+            &mut self.scratch,
+        );
         // Opening: erosion, then dilation, by squares; invalid cells take no part in the erosion.
         let radius = (0.5 * self.settings.max_width_px * cells_per_px).round().max(1.0) as usize;
-        fill_from(&mut self.opened, &self.cells, |_, cell| if cell.valid { cell.least } else { 255.0 });
+        fill_from(
+            &mut self.opened,
+            &self.cells,
+            |_, cell| if cell.valid { cell.least } else { 255.0 },
+        );
         extreme_over_square(&mut self.opened, radius, f32::min, 255.0, &mut self.blurred_weight);
         extreme_over_square(&mut self.opened, radius, f32::max, 0.0, &mut self.blurred_weight);
     }
 
     fn blur_backgrounds(&mut self, sigma: f32) {
         fill_from(&mut self.least_background, &self.cells, |_, cell| cell.least);
-        weighted_mean(&mut self.least_background, &self.weight, sigma, &mut self.blurred_weight, &mut self.scratch);
+        weighted_mean(
+            &mut self.least_background,
+            &self.weight,
+            sigma,
+            &mut self.blurred_weight,
+            &mut self.scratch,
+        );
         fill_from(&mut self.most_background, &self.cells, |_, cell| cell.most);
-        weighted_mean(&mut self.most_background, &self.weight, sigma, &mut self.blurred_weight, &mut self.scratch);
+        weighted_mean(
+            &mut self.most_background,
+            &self.weight,
+            sigma,
+            &mut self.blurred_weight,
+            &mut self.scratch,
+        );
     }
 
     fn set_bounds(&mut self) {
@@ -269,14 +306,22 @@ impl SpecularityDetector {
             let at = |x: usize| {
                 let mix = |a: f32, b: f32| a + (b - a) * part;
                 let (a, b) = (&top[x], &bottom[x]);
-                Bounds { core: mix(a.core, b.core), halo: mix(a.halo, b.halo), white: mix(a.white, b.white) }
+                Bounds {
+                    core: mix(a.core, b.core),
+                    halo: mix(a.halo, b.halo),
+                    white: mix(a.white, b.white),
+                }
             };
             // Between the centres of two cells all bounds are linear.
             let mut x = 0;
             for left in 0..=cells_across {
                 let (a, b) = (at(left.max(1) - 1), at(left.min(cells_across - 1)));
                 let begin = x;
-                let end = if left == cells_across { width } else { (left * step + step / 2).min(width) };
+                let end = if left == cells_across {
+                    width
+                } else {
+                    (left * step + step / 2).min(width)
+                };
                 let origin = left as f32 * step as f32 - 0.5 * step as f32;
                 for column in begin..end {
                     let t = ((column as f32 + 0.5 - origin) / step as f32).clamp(0.0, 1.0);
@@ -307,8 +352,14 @@ impl SpecularityDetector {
         self.counts.resize(self.components.regions().len(), [0, 0]);
         for run in self.components.runs() {
             let columns = run.begin as usize..run.end as usize;
-            let cores = self.cores.row(run.y as usize)[columns.clone()].iter().filter(|&&c| c != 0).count();
-            let clipped = image.row(run.y as usize)[columns].iter().filter(|p| p.iter().all(|&c| c >= 240)).count();
+            let cores = self.cores.row(run.y as usize)[columns.clone()]
+                .iter()
+                .filter(|&&c| c != 0)
+                .count();
+            let clipped = image.row(run.y as usize)[columns]
+                .iter()
+                .filter(|p| p.iter().all(|&c| c >= 240))
+                .count();
             let count = &mut self.counts[run.label as usize];
             *count = [count[0] + cores as u32, count[1] + clipped as u32];
         }
@@ -332,7 +383,11 @@ impl SpecularityDetector {
         fill_from(&mut self.weight, &self.cells, |_, cell| {
             let [r, g, b] = cell.rgb;
             let (most, least) = (r.max(g).max(b), r.min(g).min(b));
-            if cell.valid && most > 30.0 && most - least < saturation * most { 1.0 } else { 0.0 }
+            if cell.valid && most > 30.0 && most - least < saturation * most {
+                1.0
+            } else {
+                0.0
+            }
         });
         // Highlights on tissue are grey too, but small: keep where most of the neighbourhood is grey.
         let radius = (2.0 * width as f32 / CELLS_ACROSS as f32).round().max(1.0) as usize;
@@ -393,7 +448,13 @@ fn fill_from<P: Copy>(out: &mut Image<f32>, cells: &Image<P>, value: impl Fn(usi
 }
 
 /// values ← blur(weight · value)/blur(weight); where no weight is near, 0.
-fn weighted_mean(values: &mut Image<f32>, weight: &Image<f32>, sigma_px: f32, blurred: &mut Image<f32>, scratch: &mut BlurScratch) {
+fn weighted_mean(
+    values: &mut Image<f32>,
+    weight: &Image<f32>,
+    sigma_px: f32,
+    blurred: &mut Image<f32>,
+    scratch: &mut BlurScratch,
+) {
     for (value, w) in values.pixels_mut().iter_mut().zip(weight.pixels()) {
         *value *= w;
     }
@@ -414,7 +475,10 @@ fn extreme_over_square(image: &mut Image<f32>, radius: usize, pick: fn(f32, f32)
     for y in 0..height {
         let source = image.row(y);
         for (x, out) in rows.row_mut(y).iter_mut().enumerate() {
-            *out = source[x.saturating_sub(radius)..(x + radius + 1).min(width)].iter().copied().fold(neutral, pick);
+            *out = source[x.saturating_sub(radius)..(x + radius + 1).min(width)]
+                .iter()
+                .copied()
+                .fold(neutral, pick);
         }
     }
     for y in 0..height {
@@ -500,7 +564,11 @@ mod tests {
         for brightness in [0.4, 1.0] {
             let plain = tissue(brightness);
             let mut image = plain.clone();
-            for (x, y, radius, strength) in [(60.0, 60.0, 3.0, 220.0), (200.0, 150.0, 7.0, 230.0), (330.0, 90.0, 5.0, 120.0)] {
+            for (x, y, radius, strength) in [
+                (60.0, 60.0, 3.0, 220.0),
+                (200.0, 150.0, 7.0, 230.0),
+                (330.0, 90.0, 5.0, 120.0),
+            ] {
                 shine(&mut image, x, y, radius, strength);
             }
             let (specular, _) = detect(&image);
@@ -539,11 +607,20 @@ mod tests {
             }
         }
         let (specular, steel) = detect(&image);
-        let in_gauze = (44..156).flat_map(|y| (64..216).map(move |x| (x, y))).filter(|&(x, y)| specular.at(x, y) != 0).count();
+        let in_gauze = (44..156)
+            .flat_map(|y| (64..216).map(move |x| (x, y)))
+            .filter(|&(x, y)| specular.at(x, y) != 0)
+            .count();
         assert!(in_gauze * 50 < 152 * 112, "{in_gauze} px of gauze");
-        let on_steel = (0..HEIGHT).flat_map(|y| (300..345).map(move |x| (x, y))).filter(|&(x, y)| specular.at(x, y) != 0).count();
+        let on_steel = (0..HEIGHT)
+            .flat_map(|y| (300..345).map(move |x| (x, y)))
+            .filter(|&(x, y)| specular.at(x, y) != 0)
+            .count();
         assert_eq!(on_steel, 0);
-        let covered = (0..HEIGHT).flat_map(|y| (302..343).map(move |x| (x, y))).filter(|&(x, y)| steel.at(x, y) != 0).count();
+        let covered = (0..HEIGHT)
+            .flat_map(|y| (302..343).map(move |x| (x, y)))
+            .filter(|&(x, y)| steel.at(x, y) != 0)
+            .count();
         assert!(covered * 100 > 95 * 41 * HEIGHT, "{covered} px of steel");
     }
 }

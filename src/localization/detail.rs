@@ -40,8 +40,17 @@ fn plane() -> Image<f32> {
 
 impl Default for DetailPyramid {
     fn default() -> Self {
-        let scale = Scale { step: 1, detail: plane(), weight: plane() };
-        Self { scales: vec![scale; SCALES], luminance: plane(), known: plane(), blurred: plane() }
+        let scale = Scale {
+            step: 1,
+            detail: plane(),
+            weight: plane(),
+        };
+        Self {
+            scales: vec![scale; SCALES],
+            luminance: plane(),
+            known: plane(),
+            blurred: plane(),
+        }
     }
 }
 
