@@ -5,3 +5,8 @@ pub mod pose_stamping;
 pub mod scene_cut;
 pub mod temporal_median;
 pub mod undistortion;
+//! What happens to a frame, one file or folder per stage, in line order.
+
+pub mod pose_refinement;
+pub mod specularity_detection;
+pub mod specularity_substitution;
