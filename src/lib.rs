@@ -19,8 +19,6 @@ pub mod solver;
 pub mod sources;
 pub mod synthetic;
 pub mod localization;
-pub mod pipeline;
-pub mod progress;
 pub mod stages;
 pub mod time;
 pub mod yaml;

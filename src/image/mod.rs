@@ -12,7 +12,6 @@ pub mod pyramid;
 pub mod remap;
 pub mod wide;
 pub mod blur;
-pub mod buffer;
 pub mod components;
 pub mod distance;
 pub mod pool;
