@@ -35,9 +35,6 @@ const BAD_USAGE: u8 = 2;
 struct Cli {
     #[command(flatten)]
     globals: Globals,
-    /// Overwrite what is there.
-    #[arg(long, global = true)]
-    force: bool,
     #[command(subcommand)]
     command: Command,
 }
@@ -114,13 +111,6 @@ fn code_from(result: anyhow::Result<Ended>) -> ExitCode {
         Err(error) => {
             console::print_error(&error);
             if error.downcast_ref::<UsageError>().is_some() { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
-/// Run the command line.
-pub fn main() -> anyhow::Result<()> {
-    let cli = Cli::parse();
-    match cli.command {
-        Command::Simulate(mut args) => {
-            args.force = cli.force;
-            simulate::run(args, &Silent)
         }
     }
 }
