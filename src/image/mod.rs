@@ -12,5 +12,7 @@ pub mod patch;
 pub mod pool;
 pub mod pyramid;
 pub mod remap;
+mod remap_bilinear;
+mod remap_bicubic;
 pub mod specularity;
 pub mod wide;
