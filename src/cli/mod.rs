@@ -93,8 +93,9 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
         Command::Process(args) => process::run(&args, context),
         Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
-        Command::Simulate(args) => {
-            simulate::run(simulate::Args { force: context.force, ..args }, &context.console).map(|()| Ended::Complete)
+        Command::Simulate(mut args) => {
+            args.force = context.force;
+            simulate::run(args, &context.console).map(|()| Ended::Complete)
         }
     }
 }
