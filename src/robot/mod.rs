@@ -1,3 +1,4 @@
+
 pub mod hand_eye;
 pub mod kinematics;
 pub mod pose_buffer;
