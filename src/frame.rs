@@ -84,6 +84,8 @@ pub struct Frame {
     pub id: FrameId,
     /// When it was exposed, on the recording's clock.
     pub exposed_at: Timestamp,
+    /// When a player shows it: the stamp of the container it came from, which outputs keep.
+    pub presented_at: Timestamp,
     /// Since the frame before it; zero for the first.
     pub since_previous: Span,
     /// When we had it, on the host's clock.
@@ -122,6 +124,7 @@ impl Frame {
         Self {
             id,
             exposed_at,
+            presented_at: exposed_at,
             since_previous: Span::default(),
             arrived_at,
             image,

@@ -33,7 +33,11 @@ fn rust_files(folder: &Path, found: &mut Vec<PathBuf>) {
 
 fn room_of(source: &Path, file: &Path) -> String {
     let first = file.strip_prefix(source).unwrap().components().next().unwrap();
-    Path::new(first.as_os_str()).file_stem().unwrap().to_string_lossy().into_owned()
+    Path::new(first.as_os_str())
+        .file_stem()
+        .unwrap()
+        .to_string_lossy()
+        .into_owned()
 }
 
 #[test]
@@ -41,7 +45,12 @@ fn rooms_import_only_downward() {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let mut files = Vec::new();
     rust_files(&source, &mut files);
-    assert!(files.len() > 10, "found only {} files under {}", files.len(), source.display());
+    assert!(
+        files.len() > 10,
+        "found only {} files under {}",
+        files.len(),
+        source.display()
+    );
     let mut faults = BTreeMap::new();
     for file in files {
         let room = room_of(&source, &file);

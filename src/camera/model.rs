@@ -27,7 +27,10 @@ impl CameraModel {
         }
         let (x, y) = self.distortion.distort(p.x / p.z, p.y / p.z);
         let k = &self.intrinsics;
-        Some(Pixel { x: k.fx * x + k.cx, y: k.fy * y + k.cy })
+        Some(Pixel {
+            x: k.fx * x + k.cx,
+            y: k.fy * y + k.cy,
+        })
     }
 
     /// The direction (z = 1) that lands at `pixel`; `None` outside the lens's field.
@@ -39,7 +42,10 @@ impl CameraModel {
 
     /// The same camera without its lens: what explains the picture after undistortion.
     pub fn pinhole(&self) -> Self {
-        Self { distortion: Distortion::None, ..self.clone() }
+        Self {
+            distortion: Distortion::None,
+            ..self.clone()
+        }
     }
 
     /// The same camera with its picture scaled by `factor`.

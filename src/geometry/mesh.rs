@@ -13,6 +13,9 @@ pub struct Mesh<Space> {
 
 impl<Space> Default for Mesh<Space> {
     fn default() -> Self {
-        Self { vertices: Vec::new(), triangles: Vec::new() }
+        Self {
+            vertices: Vec::new(),
+            triangles: Vec::new(),
+        }
     }
 }

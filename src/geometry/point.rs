@@ -29,7 +29,10 @@ macro_rules! vector_like {
 
             /// From a vector of components.
             pub fn from_coords(coords: Vector3<f64>) -> Self {
-                Self { coords, space: PhantomData }
+                Self {
+                    coords,
+                    space: PhantomData,
+                }
             }
         }
 
@@ -43,7 +46,11 @@ macro_rules! vector_like {
 
         impl<Space> std::fmt::Debug for $name<Space> {
             fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                write!(f, concat!(stringify!($name), "({}, {}, {})"), self.coords.x, self.coords.y, self.coords.z)
+                write!(
+                    f,
+                    concat!(stringify!($name), "({}, {}, {})"),
+                    self.coords.x, self.coords.y, self.coords.z
+                )
             }
         }
 

@@ -24,7 +24,10 @@ impl<To, From> Transform<To, From> {
 
     /// From nalgebra's rigid motion.
     pub fn from_isometry(isometry: Isometry3<f64>) -> Self {
-        Self { isometry, spaces: PhantomData }
+        Self {
+            isometry,
+            spaces: PhantomData,
+        }
     }
 
     /// From a rotation matrix (made orthonormal) and a translation, mm.

@@ -17,7 +17,11 @@ pub struct Image<P> {
 impl<P: Copy> Image<P> {
     /// Every pixel the same.
     pub fn filled(width: usize, height: usize, value: P) -> Self {
-        Self { width, height, data: vec![value; width * height] }
+        Self {
+            width,
+            height,
+            data: vec![value; width * height],
+        }
     }
 
     /// From pixels row by row; `None` if their number is not `width * height`.

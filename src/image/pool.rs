@@ -17,14 +17,18 @@ pub struct Pool<P> {
 
 impl<P> Clone for Pool<P> {
     fn clone(&self) -> Self {
-        Self { free: Arc::clone(&self.free) }
+        Self {
+            free: Arc::clone(&self.free),
+        }
     }
 }
 
 impl<P: Copy + Default> Pool<P> {
     /// A pool that keeps at most `kept` images; more may be in flight, the surplus is freed when dropped.
     pub fn new(kept: usize) -> Self {
-        Self { free: Arc::new(ArrayQueue::new(kept.max(1))) }
+        Self {
+            free: Arc::new(ArrayQueue::new(kept.max(1))),
+        }
     }
 
     /// An image of the given size with unspecified content; allocates only when no kept one is large enough.
@@ -33,14 +37,20 @@ impl<P: Copy + Default> Pool<P> {
         if image.size() != (width, height) {
             image.resize(width, height, P::default());
         }
-        Pooled { image, home: Arc::clone(&self.free) }
+        Pooled {
+            image,
+            home: Arc::clone(&self.free),
+        }
     }
 
     /// A copy of `source` in a pooled image.
     pub fn take_copy(&self, source: &Image<P>) -> Pooled<P> {
         let mut copy = self.free.pop().unwrap_or_else(|| Image::filled(0, 0, P::default()));
         copy.copy_from(source);
-        Pooled { image: copy, home: Arc::clone(&self.free) }
+        Pooled {
+            image: copy,
+            home: Arc::clone(&self.free),
+        }
     }
 }
 

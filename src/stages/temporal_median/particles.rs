@@ -1,0 +1,277 @@
+//! Tells particles from the edges of what moves.
+//!
+//! Input: the newest frame, the median, and the pixels where they depart from each other. Each connected blob of such
+//! pixels is judged by its contrast across its own border, in the newest frame and in the median. A particle is there in
+//! the newest frame and gone in the median: the contrast falls. Where an edge has moved, the contrast has moved along and
+//! stays what it was. Where something has gone (the median still shows it), the contrast rises: motion, or a particle that
+//! stood still for too long; the newest frame is right in both cases.
+
+use crate::image::buffer::{Image, Rgb8};
+use crate::stages::temporal_median::motion::{BLOCK, BlockStats, Motion};
+use crate::stages::temporal_median::noise::Noise;
+
+/// A particle's contrast in the median is at most this share of that in the newest frame; in still and in slow blocks.
+const MAX_CONTRAST_STILL: f32 = 0.75;
+const MAX_CONTRAST_SLOW: f32 = 0.45;
+/// Below this share the other way round, something has gone.
+const GONE_CONTRAST: f32 = 0.75;
+/// Where the border is looked at: this far out, px.
+const REACH: usize = 2;
+/// What was judged is grown by this, px: the soft rim of a particle lies below the threshold.
+const GROW: usize = 2;
+/// A block whose texture exceeds the noise by this factor would have shown motion.
+const TEXTURED: f32 = 2.0;
+/// Blocks around something that has gone in which nothing is taken for a particle.
+const GONE_REACH: usize = 2;
+
+/// Bits of [`Particles::marks`].
+const SEEN: u8 = 1;
+const TAKE_MEDIAN: u8 = 2;
+const KEEP_NEWEST: u8 = 4;
+
+#[derive(Clone, Copy, Debug)]
+struct Blob {
+    first: usize,
+    count: usize,
+    left: usize,
+    top: usize,
+    right: usize,
+    bottom: usize,
+    contrast_newest: u32,
+    contrast_median: u32,
+}
+
+/// The judge and its buffers.
+#[derive(Debug, Default)]
+pub struct Particles {
+    marks: Vec<u8>,
+    stack: Vec<u32>,
+    members: Vec<u32>,
+    blobs: Vec<Blob>,
+    /// Per block: bit 0 something has gone near, bit 1 a change too large for a particle.
+    suspect: Vec<u8>,
+    busy: Vec<bool>,
+}
+
+/// What the judge looks at.
+#[derive(Debug)]
+pub struct Evidence<'a> {
+    /// The frame as it came.
+    pub newest: &'a Image<Rgb8>,
+    /// Gray of the newest frame.
+    pub gray: &'a [u8],
+    /// 255 where newest and median depart from each other.
+    pub departs: &'a [u8],
+    /// Per block.
+    pub stats: &'a [BlockStats],
+    /// Per block.
+    pub motions: &'a [Motion],
+    /// The noise.
+    pub noise: &'a Noise,
+    /// Largest extent of a particle, px.
+    pub max_extent_px: usize,
+}
+
+fn gray(color: Rgb8) -> i32 {
+    (i32::from(color[0]) + 2 * i32::from(color[1]) + i32::from(color[2]) + 2) >> 2
+}
+
+impl Particles {
+    /// Make `median` the result: newest where the guard says so, median elsewhere.
+    pub fn settle(&mut self, evidence: &Evidence<'_>, median: &mut Image<Rgb8>) {
+        let (width, height) = evidence.newest.size();
+        let columns = width.div_ceil(BLOCK);
+        self.prepare(width * height, evidence.motions.len());
+        self.find_blobs(evidence, median);
+        self.suspect_blocks(columns, evidence);
+        for index in 0..self.blobs.len() {
+            let blob = self.blobs[index];
+            let mark = if self.is_particle(&blob, columns, evidence) {
+                TAKE_MEDIAN
+            } else {
+                KEEP_NEWEST
+            };
+            for member in blob.first..blob.first + blob.count {
+                let at = self.members[member] as usize;
+                let (x, y) = (at % width, at / width);
+                for ny in y.saturating_sub(GROW)..(y + GROW + 1).min(height) {
+                    for nx in x.saturating_sub(GROW)..(x + GROW + 1).min(width) {
+                        self.marks[ny * width + nx] |= mark;
+                        self.busy[ny / BLOCK * columns + nx / BLOCK] = true;
+                    }
+                }
+            }
+        }
+        self.write(evidence, median);
+    }
+
+    fn prepare(&mut self, pixels: usize, blocks: usize) {
+        if self.marks.len() != pixels {
+            self.marks = vec![0; pixels];
+            self.stack = Vec::with_capacity(pixels);
+            self.members = Vec::with_capacity(pixels);
+            self.blobs = Vec::with_capacity(pixels / 4 + 1);
+            self.suspect = vec![0; blocks];
+            self.busy = vec![false; blocks];
+        }
+        self.marks.fill(0);
+        self.suspect.fill(0);
+        self.busy.fill(false);
+        self.members.clear();
+        self.blobs.clear();
+    }
+
+    fn find_blobs(&mut self, evidence: &Evidence<'_>, median: &Image<Rgb8>) {
+        let (width, height) = evidence.newest.size();
+        let columns = width.div_ceil(BLOCK);
+        for (by, motions) in evidence.motions.chunks_exact(columns).enumerate() {
+            for (bx, motion) in motions.iter().enumerate() {
+                if *motion == Motion::Moving {
+                    continue;
+                }
+                let (left, right) = (bx * BLOCK, (bx * BLOCK + BLOCK).min(width));
+                for y in by * BLOCK..(by * BLOCK + BLOCK).min(height) {
+                    let row = &evidence.departs[y * width + left..y * width + right];
+                    if row.iter().fold(0, |any, v| any | v) == 0 {
+                        continue;
+                    }
+                    for x in left..right {
+                        let at = y * width + x;
+                        if evidence.departs[at] != 0 && self.marks[at] & SEEN == 0 {
+                            self.flood(at, evidence, median);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn flood(&mut self, seed: usize, evidence: &Evidence<'_>, median: &Image<Rgb8>) {
+        let (width, height) = evidence.newest.size();
+        let departs = evidence.departs;
+        let first = self.members.len();
+        let (x, y) = (seed % width, seed / width);
+        let mut blob = Blob {
+            first,
+            count: 0,
+            left: x,
+            top: y,
+            right: x,
+            bottom: y,
+            contrast_newest: 0,
+            contrast_median: 0,
+        };
+        self.marks[seed] |= SEEN;
+        self.stack.push(seed as u32);
+        while let Some(at) = self.stack.pop() {
+            let at = at as usize;
+            let (x, y) = (at % width, at / width);
+            self.members.push(at as u32);
+            blob.left = blob.left.min(x);
+            blob.right = blob.right.max(x);
+            blob.top = blob.top.min(y);
+            blob.bottom = blob.bottom.max(y);
+            for ny in y.saturating_sub(1)..(y + 2).min(height) {
+                for nx in x.saturating_sub(1)..(x + 2).min(width) {
+                    let near = ny * width + nx;
+                    if departs[near] != 0 && self.marks[near] & SEEN == 0 {
+                        self.marks[near] |= SEEN;
+                        self.stack.push(near as u32);
+                    }
+                }
+            }
+            let across = [
+                (x + REACH < width).then(|| at + REACH),
+                (x >= REACH).then(|| at.wrapping_sub(REACH)),
+                (y + REACH < height).then(|| at + REACH * width),
+                (y >= REACH).then(|| at.wrapping_sub(REACH * width)),
+            ];
+            for outside in across.into_iter().flatten() {
+                if departs[outside] == 0 {
+                    let newest = evidence.gray[at].abs_diff(evidence.gray[outside]);
+                    let (m, n) = (gray(median.pixels()[at]), gray(median.pixels()[outside]));
+                    blob.contrast_newest += u32::from(newest);
+                    blob.contrast_median += m.abs_diff(n);
+                }
+            }
+        }
+        blob.count = self.members.len() - first;
+        self.blobs.push(blob);
+    }
+
+    fn suspect_blocks(&mut self, columns: usize, evidence: &Evidence<'_>) {
+        let rows = evidence.motions.len() / columns;
+        for blob in &self.blobs {
+            let large = extent(blob) > evidence.max_extent_px;
+            let gone = (blob.contrast_newest as f32) < GONE_CONTRAST * blob.contrast_median as f32;
+            if !large && !gone {
+                continue;
+            }
+            let (flag, reach) = if large { (2, 1) } else { (1, GONE_REACH) };
+            for y in (blob.top / BLOCK).saturating_sub(reach)..(blob.bottom / BLOCK + reach + 1).min(rows) {
+                for x in (blob.left / BLOCK).saturating_sub(reach)..(blob.right / BLOCK + reach + 1).min(columns) {
+                    self.suspect[y * columns + x] |= flag;
+                }
+            }
+        }
+    }
+
+    fn is_particle(&self, blob: &Blob, columns: usize, evidence: &Evidence<'_>) -> bool {
+        if extent(blob) > evidence.max_extent_px {
+            return false;
+        }
+        let mut limit = MAX_CONTRAST_STILL;
+        for y in blob.top / BLOCK..=blob.bottom / BLOCK {
+            for x in blob.left / BLOCK..=blob.right / BLOCK {
+                let block = y * columns + x;
+                let still = evidence.motions[block] == Motion::Still;
+                if !still {
+                    limit = MAX_CONTRAST_SLOW;
+                }
+                let stats = &evidence.stats[block];
+                let convinced = still && stats.texture > TEXTURED * evidence.noise.variance_at(stats.level);
+                let suspect = self.suspect[block];
+                if suspect & 2 != 0 || (suspect & 1 != 0 && !convinced) {
+                    return false;
+                }
+            }
+        }
+        (blob.contrast_median as f32) < limit * blob.contrast_newest as f32
+    }
+
+    fn write(&self, evidence: &Evidence<'_>, median: &mut Image<Rgb8>) {
+        let (width, height) = evidence.newest.size();
+        let columns = width.div_ceil(BLOCK);
+        for (block, motion) in evidence.motions.iter().enumerate() {
+            // Moving blocks hold the newest frame already.
+            if *motion == Motion::Moving || (*motion == Motion::Still && !self.busy[block]) {
+                continue;
+            }
+            let (left, top) = (block % columns * BLOCK, block / columns * BLOCK);
+            let right = (left + BLOCK).min(width);
+            for y in top..(top + BLOCK).min(height) {
+                let newest = &evidence.newest.row(y)[left..right];
+                let target = &mut median.row_mut(y)[left..right];
+                if !self.busy[block] {
+                    target.copy_from_slice(newest);
+                    continue;
+                }
+                let marks = &self.marks[y * width + left..y * width + right];
+                for ((target, newest), mark) in target.iter_mut().zip(newest).zip(marks) {
+                    let keep = if *motion == Motion::Still {
+                        mark & (KEEP_NEWEST | TAKE_MEDIAN) == KEEP_NEWEST
+                    } else {
+                        mark & TAKE_MEDIAN == 0
+                    };
+                    if keep {
+                        *target = *newest;
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn extent(blob: &Blob) -> usize {
+    (blob.right - blob.left).max(blob.bottom - blob.top) + 1
+}

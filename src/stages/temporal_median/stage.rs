@@ -1,0 +1,192 @@
+//! The temporal median as a stage of the line.
+
+use rayon::iter::{IndexedParallelIterator as _, ParallelIterator as _};
+use rayon::slice::ParallelSliceMut as _;
+
+use crate::frame::{Frame, FrameId};
+use crate::image::buffer::{Image, Rgb8};
+use crate::image::wide;
+use crate::pipeline::stage::{Stage, StageError};
+use crate::stages::scene_cut::SceneCut;
+use crate::stages::temporal_median::guard::{self, Guard};
+use crate::stages::temporal_median::history::History;
+use crate::stages::temporal_median::motion::{BLOCK, Motion};
+use crate::stages::temporal_median::particles::{Evidence, Particles};
+use crate::stages::temporal_median::settings::{Settings, SettingsError};
+use crate::stages::temporal_median::vector_median::Run;
+
+/// A gap of more periods than this makes the history worthless.
+const MAX_GAP_PERIODS: f64 = 2.6;
+/// Standard deviation of one channel's noise over that of the gray, (1² + 2² + 1²) / 4² inverted and rooted.
+const CHANNEL_OVER_GRAY: f32 = 1.633;
+/// Departures from the median below this many standard deviations are noise.
+const DEPARTURE_SIGMAS: f32 = 4.5;
+
+/// Takes away what is in the picture only for a moment.
+#[derive(Debug)]
+pub struct TemporalMedian {
+    settings: Settings,
+    history: History,
+    guard: Guard,
+    particles: Particles,
+    scene_cut: SceneCut,
+    output: Image<Rgb8>,
+    departs: Vec<u8>,
+    period_ms: Option<f64>,
+    last_id: Option<FrameId>,
+}
+
+impl TemporalMedian {
+    /// With checked settings.
+    pub fn new(settings: &Settings) -> Result<Self, SettingsError> {
+        settings.check()?;
+        Ok(Self {
+            settings: settings.clone(),
+            history: History::default(),
+            guard: Guard::default(),
+            particles: Particles::default(),
+            scene_cut: SceneCut::default(),
+            output: Image::filled(0, 0, [0; 3]),
+            departs: Vec::new(),
+            period_ms: None,
+            last_id: None,
+        })
+    }
+
+    /// What the guard found in the newest frame, one entry per block of 16 × 16 pixels, row by row; empty before there is
+    /// enough history.
+    pub fn motions(&self) -> &[Motion] {
+        &self.guard.motions
+    }
+
+    fn notice_gaps(&mut self, frame: &mut Frame) {
+        let step_ms = frame.since_previous.milliseconds();
+        let follows = self.last_id.is_none_or(|last| frame.id.0 == last.0 + 1);
+        let gap = self.period_ms.is_some_and(|period| step_ms > MAX_GAP_PERIODS * period);
+        if !follows || gap {
+            self.history.clear();
+        }
+        if step_ms > 0.0 && !gap {
+            self.period_ms = Some(self.period_ms.map_or(step_ms, |period| period + 0.1 * (step_ms - period)));
+        }
+        self.last_id = Some(frame.id);
+        if self.scene_cut.is_cut(&frame.image) {
+            frame.scene_cut = true;
+        }
+        if frame.scene_cut {
+            self.history.clear();
+        }
+    }
+
+    /// The window for the newest frame: odd, no longer than the history.
+    fn window(&self) -> usize {
+        let wanted = self.period_ms.map_or(3, |period| self.settings.frames_from_period(period));
+        let held = self.history.count();
+        let held_odd = if held % 2 == 1 { held } else { held.saturating_sub(1) };
+        wanted.min(held_odd)
+    }
+
+    fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8) {
+        let (width, height) = newest.size();
+        let columns = width.div_ceil(BLOCK);
+        let window = std::array::from_fn(|age| self.history.planes(age));
+        let motions = &self.guard.motions;
+        let (method, distance) = (self.settings.method, self.settings.distance);
+        self.output
+            .pixels_mut()
+            .par_chunks_mut(BLOCK * width)
+            .zip(self.departs[..width * height].par_chunks_mut(BLOCK * width))
+            .enumerate()
+            .for_each(|(band, (output, departs))| {
+                let motions = &motions[band * columns..(band + 1) * columns];
+                let top = band * BLOCK;
+                let rows = output.chunks_exact_mut(width).zip(departs.chunks_exact_mut(width));
+                for (y, (output, departs)) in rows.enumerate() {
+                    let mut block = 0;
+                    for run in motions.chunk_by(|a, b| (*a == Motion::Moving) == (*b == Motion::Moving)) {
+                        let (left, right) = (block * BLOCK, ((block + run.len()) * BLOCK).min(width));
+                        block += run.len();
+                        if run[0] == Motion::Moving {
+                            output[left..right].copy_from_slice(&newest.row(top + y)[left..right]);
+                            departs[left..right].fill(0);
+                        } else {
+                            wide::run(Run::<N> {
+                                window,
+                                start: (top + y) * width + left,
+                                median: &mut output[left..right],
+                                departs: &mut departs[left..right],
+                                threshold,
+                                method,
+                                distance,
+                            });
+                        }
+                    }
+                }
+            });
+    }
+}
+
+impl Stage for TemporalMedian {
+    fn name(&self) -> &'static str {
+        "temporal_median"
+    }
+
+    fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
+        let size = frame.image.size();
+        if size.0 == 0 || size.1 == 0 {
+            return Err(StageError(
+                "expected a picture, found one without pixels; check the source".to_owned(),
+            ));
+        }
+        self.notice_gaps(frame);
+        self.history.push(&frame.image, BLOCK);
+        let window = self.window();
+        self.guard.clear();
+        let period_s = self.period_ms.unwrap_or(40.0) * 1e-3;
+        let too_fast = guard::camera_motion_px(frame, period_s).is_some_and(|motion| motion > self.settings.max_camera_motion_px);
+        if window < 3 || (too_fast && self.settings.motion_guard) {
+            return Ok(());
+        }
+        if self.output.size() != size {
+            self.output.resize(size.0, size.1, [0; 3]);
+            self.departs = vec![0; size.0 * size.1];
+        }
+        self.guard.judge(&self.history, window, size);
+        if !self.settings.motion_guard {
+            self.guard.motions.fill(Motion::Still);
+        }
+        let sigma = self.guard.noise.variance_at(128.0).sqrt() * CHANNEL_OVER_GRAY;
+        let threshold = (self.settings.min_particle_levels as f32)
+            .max(DEPARTURE_SIGMAS * sigma)
+            .min(120.0) as u8;
+        match window {
+            3 => self.median::<3>(&frame.image, threshold),
+            5 => self.median::<5>(&frame.image, threshold),
+            _ => self.median::<7>(&frame.image, threshold),
+        }
+        if self.settings.motion_guard {
+            let max_extent_px = (self.settings.max_particle_share * size.1 as f64).max(20.0) as usize;
+            let evidence = Evidence {
+                newest: &frame.image,
+                gray: &self.history.planes(0).gray,
+                departs: &self.departs,
+                stats: &self.guard.stats,
+                motions: &self.guard.motions,
+                noise: &self.guard.noise,
+                max_extent_px,
+            };
+            self.particles.settle(&evidence, &mut self.output);
+        }
+        frame.image.swap(&mut self.output);
+        Ok(())
+    }
+
+    fn reset(&mut self) {
+        self.history.clear();
+        self.guard.clear();
+        self.guard.noise.clear();
+        self.scene_cut.clear();
+        self.period_ms = None;
+        self.last_id = None;
+    }
+}
