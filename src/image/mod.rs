@@ -1,7 +1,5 @@
 //! Images: pixel buffers, their pool, and what is done to pixels without knowing what they show.
 
-mod remap_bicubic;
-mod remap_bilinear;
 pub mod buffer;
 pub mod color;
 pub mod corners;
@@ -11,4 +9,6 @@ pub mod patch;
 pub mod pool;
 pub mod pyramid;
 pub mod remap;
+mod remap_bicubic;
+mod remap_bilinear;
 pub mod wide;
