@@ -9,8 +9,8 @@ use endofield::pipeline::queue::Queue;
 use endofield::recording::folder::{Recording, Video};
 use endofield::time::ManualClock;
 
-use crate::support::line::{Keeping, Seen};
-use crate::support::scene::{Wandering, laparoscope};
+use crate::support::line::{Keeping, Seen, Wandering};
+use crate::support::scene::laparoscope;
 
 fn run_once() -> Seen {
     let (width, height) = (192, 128);

@@ -2,7 +2,9 @@
 
 pub mod console;
 pub mod context;
+pub mod demo;
 pub mod light_field;
+pub mod measure;
 pub mod outputs;
 pub mod process;
 pub mod report;
@@ -41,6 +43,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Demo(demo::Args),
     Process(process::Args),
     LightField(light_field::Args),
     Simulate(simulate::Args),
@@ -91,6 +94,7 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
 
 fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
+        Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
         Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
         Command::Simulate(mut args) => {

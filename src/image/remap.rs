@@ -60,6 +60,9 @@ pub enum RemapError {
     },
 }
 
+/// Fills one output row from its entries, its blocks' bases and the source.
+pub(crate) type RowKernel = fn(&[u32], &[u32], &Image<Rgb8>, &mut [Rgb8]);
+
 /// A place in the source: the pixel to the upper left and 1/32 px from it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Place {
@@ -153,10 +156,10 @@ impl RemapTable {
         if out.size() != self.size() {
             out.resize(self.width, self.height, [0; 3]);
         }
-        let row_kernel: fn(&[u32], &[u32], &Image<Rgb8>, &mut [Rgb8]) = match interpolation {
+        let row_kernel: RowKernel = match interpolation {
             Interpolation::Nearest => nearest_row,
             Interpolation::Bilinear => remap_bilinear::row_kernel(),
-            Interpolation::Bicubic => remap_bicubic::row,
+            Interpolation::Bicubic => remap_bicubic::row_kernel(),
         };
         self.each_row(out.pixels_mut(), |entries, bases, row| row_kernel(entries, bases, source, row));
         let edge_kernel: fn(&Image<Rgb8>, Place) -> Rgb8 = match interpolation {

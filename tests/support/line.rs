@@ -9,6 +9,8 @@ use endofield::image::pool::Pool;
 use endofield::pipeline::stage::{Sink, SinkError, Source, SourceError, Stage, StageError};
 use endofield::time::Timestamp;
 
+use crate::support::scene;
+
 /// A gray frame whose level is its number.
 pub fn numbered_frame(number: u64, pool: &Pool<Rgb8>) -> Frame {
     let mut image = pool.take(8, 4);
@@ -165,5 +167,30 @@ impl Sink for Keeping {
     fn finish(&mut self) -> Result<(), SinkError> {
         *self.seen.finished.lock().unwrap() += 1;
         Ok(())
+    }
+}
+
+/// So many frames of the stand-in for an operation.
+pub struct Wandering {
+    size: (usize, usize),
+    next: u64,
+    count: u64,
+    pool: Pool<Rgb8>,
+}
+
+impl Wandering {
+    pub fn new(width: usize, height: usize, count: u64) -> Self {
+        Self { size: (width, height), next: 0, count, pool: Pool::new(16) }
+    }
+}
+
+impl Source for Wandering {
+    fn next_frame(&mut self) -> Result<Option<Frame>, SourceError> {
+        if self.next == self.count {
+            return Ok(None);
+        }
+        self.next += 1;
+        let image = scene::picture(self.size.0, self.size.1, self.next - 1);
+        Ok(Some(scene::frame(self.next - 1, &image, &self.pool)))
     }
 }
