@@ -13,7 +13,7 @@ use crate::stages::temporal_median::history::History;
 use crate::stages::temporal_median::motion::{BLOCK, Motion};
 use crate::stages::temporal_median::particles::{Evidence, Particles};
 use crate::stages::temporal_median::settings::{Settings, SettingsError};
-use crate::stages::temporal_median::vector_median::Run;
+use crate::stages::temporal_median::vector_median::{Colors, Run, Wide};
 
 /// A gap of more periods than this makes the history worthless.
 const MAX_GAP_PERIODS: f64 = 2.6;
@@ -86,7 +86,10 @@ impl TemporalMedian {
         wanted.min(held_odd)
     }
 
-    fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8) {
+    fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8)
+    where
+        [Wide; N]: Colors<N>,
+    {
         let (width, height) = newest.size();
         let columns = width.div_ceil(BLOCK);
         let window = std::array::from_fn(|age| self.history.planes(age));
