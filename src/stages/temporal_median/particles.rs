@@ -201,6 +201,18 @@ impl Particles {
 
     fn suspect_blocks(&mut self, columns: usize, evidence: &Evidence<'_>) {
         let rows = evidence.motions.len() / columns;
+        // Blobs are not sought in moving blocks, so what has gone from there is not found either: a specularity that
+        // wanders from a moving block into a smooth still one would look like a particle.
+        for (block, motion) in evidence.motions.iter().enumerate() {
+            if *motion == Motion::Moving {
+                let (bx, by) = (block % columns, block / columns);
+                for y in by.saturating_sub(1)..(by + 2).min(rows) {
+                    for x in bx.saturating_sub(1)..(bx + 2).min(columns) {
+                        self.suspect[y * columns + x] |= 1;
+                    }
+                }
+            }
+        }
         for blob in &self.blobs {
             let large = extent(blob) > evidence.max_extent_px;
             let gone = (blob.contrast_newest as f32) < GONE_CONTRAST * blob.contrast_median as f32;

@@ -85,7 +85,8 @@ where
                 let pixel = <[Wide; N]>::gather(&colors, i);
                 let [r, g, b] = choose(pixel);
                 let [now_r, now_g, now_b] = pixel[0];
-                let apart = (r - now_r).abs().max((g - now_g).abs()).max((b - now_b).abs());
+                let apart = |a: i16, b: i16| a.wrapping_sub(b).wrapping_abs();
+                let apart = apart(r, now_r).max(apart(g, now_g)).max(apart(b, now_b));
                 far[i] = if apart > threshold { 255 } else { 0 };
                 red[i] = r;
                 green[i] = g;
@@ -104,13 +105,15 @@ where
 
 #[inline(always)]
 fn l1(a: Wide, b: Wide) -> i16 {
-    (a[0] - b[0]).abs() + (a[1] - b[1]).abs() + (a[2] - b[2]).abs()
+    // Nothing can overflow; wrapping arithmetic says so to builds that check, which could not vectorize otherwise.
+    let apart = |c: usize| a[c].wrapping_sub(b[c]).wrapping_abs();
+    apart(0).wrapping_add(apart(1)).wrapping_add(apart(2))
 }
 
 /// Euclidean distance in units of 1/8 level: six of them still fit into 16 bits (6 · 441.7 · 8 = 21 200).
 #[inline(always)]
 fn l2(a: Wide, b: Wide) -> i16 {
-    let [r, g, b] = [0, 1, 2].map(|c| f32::from(a[c] - b[c]));
+    let [r, g, b] = [0, 1, 2].map(|c| f32::from(a[c].wrapping_sub(b[c])));
     // The integer in the low bits, as a plain conversion would give, but with a vector instruction.
     ((r * r + g * g + b * b).sqrt() * 8.0 + 8_388_608.0).to_bits() as i16
 }
@@ -141,8 +144,8 @@ macro_rules! colors {
                 let mut sums = [0_i16; $n];
                 $(
                     let apart = distance(self[$i], self[$j]);
-                    sums[$i] += apart;
-                    sums[$j] += apart;
+                    sums[$i] = sums[$i].wrapping_add(apart);
+                    sums[$j] = sums[$j].wrapping_add(apart);
                 )*
                 let mut least = sums[0];
                 let [mut r, mut g, mut b] = self[0];
