@@ -146,7 +146,7 @@ pub fn keep_surround(source: &[Rgb8], target: &mut [Rgb8], field_of_view: &[u8])
 #[inline(always)]
 fn byte_from(value: f32) -> u8 {
     const INTEGER_BITS: f32 = 8_388_608.0;
-    (value.max(0.0).min(255.0) + INTEGER_BITS).to_bits() as u8
+    (value.clamp(0.0, 255.0) + INTEGER_BITS).to_bits() as u8
 }
 
 #[inline(always)]
