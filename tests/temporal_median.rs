@@ -195,8 +195,10 @@ fn particles_over_still_tissue_go() {
             &clip.seen,
         );
         let (worst, fair) = report(&format!("still, {method:?}"), &clip, &filtered);
+        // Only the first frame, before which there is nothing, is left as it came.
+        let (all, _) = restored(&clip, &filtered, |_, _| true);
         assert!(worst > -0.01);
-        assert!(fair >= 0.95);
+        assert!(fair >= 0.97 && all > 0.9, "{fair} {all}");
     }
 }
 

@@ -78,12 +78,13 @@ impl TemporalMedian {
         }
     }
 
-    /// The window for the newest frame: odd, no longer than the history.
+    /// The window for the newest frame: odd, no longer than the history. Two frames make a window of three in which the
+    /// older one counts twice: the median is the older one, and the guard decides whether it knows better.
     fn window(&self) -> usize {
         let wanted = self.period_ms.map_or(3, |period| self.settings.frames_from_period(period));
         let held = self.history.count();
         let held_odd = if held % 2 == 1 { held } else { held.saturating_sub(1) };
-        wanted.min(held_odd)
+        if held == 2 { 3 } else { wanted.min(held_odd) }
     }
 
     fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8)
@@ -92,7 +93,8 @@ impl TemporalMedian {
     {
         let (width, height) = newest.size();
         let columns = width.div_ceil(BLOCK);
-        let window = std::array::from_fn(|age| self.history.planes(age));
+        let oldest = self.history.count().saturating_sub(1);
+        let window = std::array::from_fn(|age| self.history.planes(age.min(oldest)));
         let motions = &self.guard.motions;
         let (method, distance) = (self.settings.method, self.settings.distance);
         self.output
@@ -177,6 +179,7 @@ impl Stage for TemporalMedian {
                 motions: &self.guard.motions,
                 noise: &self.guard.noise,
                 max_extent_px,
+                particles_only: self.history.count() == 2,
             };
             self.particles.settle(&evidence, &mut self.output);
         }
