@@ -54,7 +54,9 @@ pub struct Provenance {
 /// What the light field had to say about a frame, in figures.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Alignment {
-    /// Root mean square residual of the picture against the light field after alignment, gray levels.
+    /// How well the picture's detail agrees with the light field's, −1…1.
+    pub correlation: f32,
+    /// Root mean square residual of the picture against the light field around the filled regions, gray levels.
     pub residual_levels: f32,
     /// How far the picture moved the arm's pose, px at the scene, median over the picture.
     pub correction_px: f32,
@@ -84,6 +86,8 @@ pub struct Frame {
     pub id: FrameId,
     /// When it was exposed, on the recording's clock.
     pub exposed_at: Timestamp,
+    /// When a player shows it: the stamp of the container it came from, which outputs keep.
+    pub presented_at: Timestamp,
     /// Since the frame before it; zero for the first.
     pub since_previous: Span,
     /// When we had it, on the host's clock.
@@ -122,6 +126,7 @@ impl Frame {
         Self {
             id,
             exposed_at,
+            presented_at: exposed_at,
             since_previous: Span::default(),
             arrived_at,
             image,

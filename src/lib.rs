@@ -1,12 +1,24 @@
 //! endofield: endoscope video, clearer than the endoscope saw it, a moment later, always.
 
 pub mod camera;
+pub mod cli;
+pub mod compose;
+pub mod config;
 pub mod frame;
 pub mod geometry;
 pub mod image;
 pub mod light_field;
+pub mod media;
 pub mod pipeline;
 pub mod progress;
+pub mod quality;
+pub mod recording;
+pub mod robot;
+pub mod sinks;
+pub mod solver;
+pub mod sources;
+pub mod synthetic;
+pub mod localization;
 pub mod stages;
 pub mod time;
 pub mod yaml;

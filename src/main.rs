@@ -1,3 +1,7 @@
 //! The `endofield` command.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    endofield::cli::main()
+}

@@ -33,6 +33,8 @@ pub trait Stage: Send {
     fn process(&mut self, frame: &mut Frame) -> Result<(), StageError>;
     /// After a gap or an error: forget history.
     fn reset(&mut self) {}
+    /// From the next frame on, this much of the effect is wanted, 0–1. A stage that only knows all or nothing ignores it.
+    fn set_strength(&mut self, _strength: f32) {}
 }
 
 /// Where frames go.

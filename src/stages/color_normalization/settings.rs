@@ -82,7 +82,7 @@ impl Default for Settings {
 
 /// A setting out of its bounds.
 #[derive(Debug, thiserror::Error, PartialEq)]
-#[error("color_normalization.{key} is {value}, expected {bound}; change it in the configuration or with --set")]
+#[error("color.{key} is {value}, expected {bound}; change it in the configuration or with --set")]
 pub struct SettingsError {
     /// Which setting.
     pub key: &'static str,

@@ -89,7 +89,7 @@ impl ColorNormalization {
             Some("color normalization is switched off (method = none or strength = 0) and nothing else is asked for")
         } else {
             Some(
-                "no color.yaml beside the recording and no reference set: colors are left as they are (color_normalization.reference = \"start\" holds the clip's own)",
+                "no color.yaml beside the recording and no reference set: colors are left as they are (color.reference = \"start\" holds the clip's own)",
             )
         }
     }

@@ -62,7 +62,7 @@ impl Default for Settings {
 
 /// A setting out of its bounds.
 #[derive(Debug, thiserror::Error, PartialEq)]
-#[error("temporal_median.{key} is {value}, expected {bound}; change it in the configuration or with --set")]
+#[error("median.{key} is {value}, expected {bound}; change it in the configuration or with --set")]
 pub struct SettingsError {
     /// Which setting.
     pub key: &'static str,

@@ -1,0 +1,5 @@
+//! Depth of the views: plane sweep, semi-global smoothing, consistency across views.
+
+pub mod plane_sweep;
+pub mod semi_global;
+pub mod stereo;

@@ -1,0 +1,4 @@
+//! Solvers: unknowns from measurements, knowing nothing of what they mean.
+
+pub mod bundle_adjustment;
+pub mod robust_loss;

@@ -1,0 +1,40 @@
+//! The same input gives the same output, byte for byte, however the threads happen to run.
+
+use std::sync::Arc;
+
+use endofield::compose::{self, Choice, Equipment};
+use endofield::config::Config;
+use endofield::pipeline::builder::Pipeline;
+use endofield::pipeline::queue::Queue;
+use endofield::recording::folder::{Recording, Video};
+use endofield::time::ManualClock;
+
+use crate::support::line::{Keeping, Seen};
+use crate::support::scene::{Wandering, laparoscope};
+
+fn run_once() -> Seen {
+    let (width, height) = (192, 128);
+    let recording = Recording { camera: Some(laparoscope(width, height)), ..Recording::plain(Video::File("none".into())) };
+    let equipment = Equipment { recording: &recording, light_field: None, size: (width, height) };
+    let line = compose::line(&Config::default(), &Choice::ALL, &equipment).unwrap();
+    assert!(line.stages.len() >= 3, "the line has its stages");
+    let (sink, seen) = Keeping::new("sink");
+    let mut builder = Pipeline::builder(Box::new(Wandering::new(width, height, 24)), Arc::new(ManualClock::default()));
+    for stage in line.stages {
+        builder = builder.stage(stage);
+    }
+    let outcome = builder.sink(Box::new(sink), Queue::blocking(2)).build().unwrap().start().unwrap().wait();
+    assert!(outcome.faults().is_empty(), "{:?}", outcome.faults());
+    assert!(outcome.stages.iter().all(|stage| stage.failures == 0), "{:?}", outcome.stages);
+    seen
+}
+
+#[test]
+fn twice_the_same_is_the_same() {
+    let (first, second) = (run_once(), run_once());
+    let (first, second) = (first.frames.lock().unwrap(), second.frames.lock().unwrap());
+    assert_eq!(first.len(), 24);
+    for (one, other) in first.iter().zip(second.iter()) {
+        assert!(one == other, "frame {} differs", one.0);
+    }
+}
