@@ -21,6 +21,8 @@ const MAX_GAP_PERIODS: f64 = 2.6;
 const CHANNEL_OVER_GRAY: f32 = 1.633;
 /// Departures from the median below this many standard deviations are noise.
 const DEPARTURE_SIGMAS: f32 = 4.5;
+/// With only one older frame there is no median yet: its noise is that of a frame, and nothing confirms it.
+const TWO_FRAMES_CAUTION: f32 = 1.8;
 
 /// Takes away what is in the picture only for a moment.
 #[derive(Debug)]
@@ -161,9 +163,10 @@ impl Stage for TemporalMedian {
             self.guard.motions.fill(Motion::Still);
         }
         let sigma = self.guard.noise.variance_at(128.0).sqrt() * CHANNEL_OVER_GRAY;
-        let threshold = (self.settings.min_particle_levels as f32)
-            .max(DEPARTURE_SIGMAS * sigma)
-            .min(120.0) as u8;
+        let two_frames = self.history.count() == 2;
+        let caution = if two_frames { TWO_FRAMES_CAUTION } else { 1.0 };
+        let threshold = (self.settings.min_particle_levels as f32).max(DEPARTURE_SIGMAS * sigma);
+        let threshold = (caution * threshold).min(120.0) as u8;
         match window {
             3 => self.median::<3>(&frame.image, threshold),
             5 => self.median::<5>(&frame.image, threshold),
@@ -179,7 +182,7 @@ impl Stage for TemporalMedian {
                 motions: &self.guard.motions,
                 noise: &self.guard.noise,
                 max_extent_px,
-                particles_only: self.history.count() == 2,
+                particles_only: two_frames,
             };
             self.particles.settle(&evidence, &mut self.output);
         }
