@@ -12,6 +12,9 @@ mod recording;
 mod robot;
 mod undistortion;
 mod media;
+#![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
+
+mod architecture;
 mod cli;
 mod color;
 mod config;
