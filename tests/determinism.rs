@@ -9,8 +9,8 @@ use endofield::pipeline::queue::Queue;
 use endofield::recording::folder::{Recording, Video};
 use endofield::time::ManualClock;
 
-use crate::support::line::{Keeping, Seen};
-use crate::support::scene::{Wandering, laparoscope};
+use crate::support::line::{Keeping, Seen, Wandering};
+use crate::support::scene::laparoscope;
 
 fn run_once() -> Seen {
     let (width, height) = (192, 128);
@@ -35,6 +35,6 @@ fn twice_the_same_is_the_same() {
     let (first, second) = (first.frames.lock().unwrap(), second.frames.lock().unwrap());
     assert_eq!(first.len(), 24);
     for (one, other) in first.iter().zip(second.iter()) {
-        assert!(one == other, "frame {} differs", one.0);
+        assert!(one == other, "frame {} differs", one.id);
     }
 }

@@ -5,3 +5,4 @@ pub mod file;
 pub mod intrinsics;
 pub mod model;
 pub mod opencv_xml;
+pub mod undistortion;

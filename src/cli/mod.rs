@@ -2,7 +2,9 @@
 
 pub mod console;
 pub mod context;
+pub mod demo;
 pub mod light_field;
+pub mod measure;
 pub mod outputs;
 pub mod process;
 pub mod report;
@@ -20,7 +22,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::cli::console::Console;
 use crate::cli::context::{Context, Ended, Globals, UsageError};
-use crate::config::Config;
+use crate::config::{Config, ConfigError};
 
 /// What a shell sees when the user pressed Ctrl-C.
 const INTERRUPTED: u8 = 130;
@@ -41,6 +43,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Demo(demo::Args),
     Process(process::Args),
     LightField(light_field::Args),
     Simulate(simulate::Args),
@@ -91,6 +94,7 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
 
 fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
+        Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
         Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
         Command::Simulate(args) => simulate::run(args, context),
@@ -110,7 +114,8 @@ fn code_from(result: anyhow::Result<Ended>) -> ExitCode {
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
             console::print_error(&error);
-            if error.downcast_ref::<UsageError>().is_some() { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
+            let of_usage = error.downcast_ref::<UsageError>().is_some() || matches!(error.downcast_ref(), Some(ConfigError::Set { .. }));
+            if of_usage { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
         }
     }
 }

@@ -11,8 +11,11 @@ use crate::cli::context::{Context, Ended, UsageError};
 use crate::cli::outputs::{Outputs, beside};
 use crate::cli::report::Report;
 use crate::compose::{self, Choice, Equipment, Line};
+use crate::config::Config;
+use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::field_of_view;
 use crate::image::pool::Pool;
-use crate::light_field::file as light_field_file;
+use crate::light_field::build::{self, BuildSettings};
 use crate::media::reader::{Input, VideoReader};
 use crate::media::writer::{Output, Sound, VideoWriter, WriterSettings};
 use crate::pipeline::builder::Pipeline;
@@ -66,6 +69,11 @@ pub struct Args {
     pub end: Option<f64>,
 }
 
+/// The image field is looked for in so many frames …
+const FIELD_FRAMES: usize = 8;
+/// … of which each is so far from the one before.
+const FIELD_STEP: usize = 6;
+
 /// What came of it.
 #[derive(Debug)]
 pub struct Processed {
@@ -106,7 +114,7 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     let info = reader.info().clone();
     recording.check_video_size(info.width, info.height)?;
     let light_field = match &args.light_field {
-        Some(folder) => Some(Arc::new(light_field_file::read(folder, &context.console)?.light_field)),
+        Some(folder) => Some(Arc::new(build::open(folder, &BuildSettings::default(), &context.console)?)),
         None => None,
     };
     let equipment = Equipment { recording: &recording, light_field, size: (info.width, info.height) };
@@ -125,7 +133,13 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     let queue = Queue::blocking(context.config.line.frames_before_sinks);
     let clock: Arc<dyn Clock> = Arc::new(MonotonicClock);
     let pool = Pool::new(64);
-    let playback = Playback { exposure_times: recording.frame_times.clone(), start: span.start, end: span.end, ..Playback::default() };
+    let playback = Playback {
+        exposure_times: recording.frame_times.clone(),
+        start: span.start,
+        end: span.end,
+        camera: recording.camera.clone().map(Arc::new),
+        field_of_view: image_field(&input, span, &context.config)?.map(Arc::new),
+    };
     let source = RecordingSource::new(reader, playback, Arc::clone(&clock), pool)?;
     let mut builder = Pipeline::builder(Box::new(source), Arc::clone(&clock))
         .entry(Queue::blocking(context.config.line.frames_between_stages))
@@ -199,6 +213,28 @@ fn open_recording(input: &Path) -> anyhow::Result<Recording> {
         return Ok(Recording::plain(Video::Frames(input.to_owned())));
     }
     Ok(Recording::open(input)?)
+}
+
+/// The endoscope's image field, from a few frames of the part that is asked for. A stream cannot be read twice, so it has none.
+fn image_field(input: &Input, span: TimeSpan, config: &Config) -> anyhow::Result<Option<Mask>> {
+    if *input == Input::Y4mStdin {
+        return Ok(None);
+    }
+    let mut reader = VideoReader::open(input)?;
+    if let Some(start) = span.start {
+        reader.seek(start)?;
+    }
+    let pool = Pool::new(1);
+    let mut frames = Vec::new();
+    for number in 0..FIELD_FRAMES * FIELD_STEP {
+        // What is wrong with the video is told when it is played.
+        let Ok(Some(frame)) = reader.next_frame(&pool) else { break };
+        if number % FIELD_STEP == 0 {
+            frames.push(frame.image);
+        }
+    }
+    let seen: Vec<&Image<Rgb8>> = frames.iter().map(|frame| &**frame).collect();
+    Ok(field_of_view::find(&seen, &config.field_of_view).map(|field| field.mask))
 }
 
 fn check_outputs(args: &Args, recording: &Recording, context: &Context) -> anyhow::Result<()> {

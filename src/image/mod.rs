@@ -1,10 +1,14 @@
 //! Images: pixel buffers, their pool, and what is done to pixels without knowing what they show.
 
+mod remap_bicubic;
+mod remap_bilinear;
 pub mod buffer;
 pub mod color;
 pub mod corners;
+pub mod field_of_view;
 pub mod gradient;
 pub mod patch;
 pub mod pool;
 pub mod pyramid;
+pub mod remap;
 pub mod wide;

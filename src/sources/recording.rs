@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
+use crate::camera::model::CameraModel;
 use crate::frame::{Frame, FrameId};
-use crate::image::buffer::Rgb8;
+use crate::image::buffer::{Mask, Rgb8};
 use crate::image::pool::Pool;
 use crate::media::reader::{VideoInfo, VideoReader};
 use crate::pipeline::stage::{Source, SourceError};
@@ -18,8 +19,10 @@ pub struct Playback {
     pub start: Option<Timestamp>,
     /// End before the first frame stamped so or later (container's time).
     pub end: Option<Timestamp>,
-    /// Keep each picture as it came beside the treated one, for a side-by-side output.
-    pub keep_original: bool,
+    /// Explains the pixels, where known.
+    pub camera: Option<Arc<CameraModel>>,
+    /// 255 inside the endoscope's image field, where one was found.
+    pub field_of_view: Option<Arc<Mask>>,
 }
 
 /// Plays a recording into the line.
@@ -91,11 +94,11 @@ impl Source for RecordingSource {
             return Ok(None);
         };
         let exposed_at = self.exposure_of(decoded.number, decoded.timestamp)?;
-        let original = self.playback.keep_original.then(|| self.pool.take_copy(&decoded.image));
         let mut frame = Frame::new(FrameId(decoded.number), exposed_at, self.clock.now(), decoded.image);
         frame.presented_at = decoded.timestamp;
         frame.since_previous = self.previous.map_or(Span(0), |previous| exposed_at - previous);
-        frame.original = original;
+        frame.camera.clone_from(&self.playback.camera);
+        frame.field_of_view.clone_from(&self.playback.field_of_view);
         self.previous = Some(exposed_at);
         Ok(Some(frame))
     }

@@ -9,6 +9,8 @@ use endofield::image::pool::Pool;
 use endofield::pipeline::stage::{Sink, SinkError, Source, SourceError, Stage, StageError};
 use endofield::time::Timestamp;
 
+use crate::support::scene;
+
 /// A gray frame whose level is its number.
 pub fn numbered_frame(number: u64, pool: &Pool<Rgb8>) -> Frame {
     let mut image = pool.take(8, 4);
@@ -96,21 +98,28 @@ pub fn adding(name: &'static str, levels: u8) -> Box<dyn Stage> {
     })
 }
 
+/// A frame's number and its picture's bytes.
+#[derive(PartialEq)]
+pub struct SeenFrame {
+    pub id: u64,
+    pub bytes: Vec<u8>,
+}
+
 /// What a sink has seen.
 #[derive(Clone, Default)]
 pub struct Seen {
-    pub frames: Arc<Mutex<Vec<(u64, Vec<u8>)>>>,
+    pub frames: Arc<Mutex<Vec<SeenFrame>>>,
     pub finished: Arc<Mutex<u32>>,
 }
 
 impl Seen {
     pub fn ids(&self) -> Vec<u64> {
-        self.frames.lock().unwrap().iter().map(|(id, _)| *id).collect()
+        self.frames.lock().unwrap().iter().map(|frame| frame.id).collect()
     }
 
     /// The level of each frame's first pixel.
     pub fn levels(&self) -> Vec<u8> {
-        self.frames.lock().unwrap().iter().map(|(_, bytes)| bytes[0]).collect()
+        self.frames.lock().unwrap().iter().map(|frame| frame.bytes[0]).collect()
     }
 
     pub fn finished(&self) -> u32 {
@@ -158,12 +167,37 @@ impl Sink for Keeping {
         if self.fail_at == Some(frame.id.0) {
             return Err(SinkError("the disk is full".to_owned()));
         }
-        self.seen.frames.lock().unwrap().push((frame.id.0, frame.image.as_bytes().to_vec()));
+        self.seen.frames.lock().unwrap().push(SeenFrame { id: frame.id.0, bytes: frame.image.as_bytes().to_vec() });
         Ok(())
     }
 
     fn finish(&mut self) -> Result<(), SinkError> {
         *self.seen.finished.lock().unwrap() += 1;
         Ok(())
+    }
+}
+
+/// So many frames of the stand-in for an operation.
+pub struct Wandering {
+    size: (usize, usize),
+    next: u64,
+    count: u64,
+    pool: Pool<Rgb8>,
+}
+
+impl Wandering {
+    pub fn new(width: usize, height: usize, count: u64) -> Self {
+        Self { size: (width, height), next: 0, count, pool: Pool::new(16) }
+    }
+}
+
+impl Source for Wandering {
+    fn next_frame(&mut self) -> Result<Option<Frame>, SourceError> {
+        if self.next == self.count {
+            return Ok(None);
+        }
+        self.next += 1;
+        let image = scene::picture(self.size.0, self.size.1, self.next - 1);
+        Ok(Some(scene::frame(self.next - 1, &image, &self.pool)))
     }
 }

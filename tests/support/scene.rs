@@ -6,7 +6,6 @@ use endofield::camera::model::CameraModel;
 use endofield::frame::{Frame, FrameId};
 use endofield::image::buffer::{Image, Rgb8};
 use endofield::image::pool::Pool;
-use endofield::pipeline::stage::{Source, SourceError};
 use endofield::time::{Span, Timestamp};
 
 /// A laparoscope-like lens.
@@ -56,29 +55,4 @@ pub fn frame(number: u64, image: &Image<Rgb8>, pool: &Pool<Rgb8>) -> Frame {
     let mut frame = Frame::new(FrameId(number), exposed_at, Timestamp(0), pool.take_copy(image));
     frame.since_previous = Span(if number == 0 { 0 } else { 40_000_000 });
     frame
-}
-
-/// So many frames of it.
-pub struct Wandering {
-    size: (usize, usize),
-    next: u64,
-    count: u64,
-    pool: Pool<Rgb8>,
-}
-
-impl Wandering {
-    pub fn new(width: usize, height: usize, count: u64) -> Self {
-        Self { size: (width, height), next: 0, count, pool: Pool::new(16) }
-    }
-}
-
-impl Source for Wandering {
-    fn next_frame(&mut self) -> Result<Option<Frame>, SourceError> {
-        if self.next == self.count {
-            return Ok(None);
-        }
-        self.next += 1;
-        let image = picture(self.size.0, self.size.1, self.next - 1);
-        Ok(Some(frame(self.next - 1, &image, &self.pool)))
-    }
 }
