@@ -43,13 +43,14 @@ fn help_has_an_example_and_succeeds() {
 fn bad_usage_is_2() {
     let folder = tempfile::tempdir().unwrap();
     pictures(&folder.path().join("in"), 2);
-    let wrong: [&[&str]; 7] = [
+    let wrong: [&[&str]; 8] = [
         &[],
         &["improve"],
         &["process", "in"],
         &["process", "in", "-o", "out.mp3"],
         &["process", "in", "-o", "out/", "--stages", "median,colour"],
         &["process", "in", "-o", "out/", "--set", "output.crf"],
+        &["process", "in", "-o", "out/", "--set", "output.crf=99"],
         &["process", "in", "-o", "out/", "--start", "2", "--end", "1"],
     ];
     for arguments in wrong {

@@ -1,4 +1,5 @@
 //! The integration tests, one binary.
+#![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
 
 mod architecture;
 mod cli;

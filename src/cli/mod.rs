@@ -22,7 +22,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::cli::console::Console;
 use crate::cli::context::{Context, Ended, Globals, UsageError};
-use crate::config::Config;
+use crate::config::{Config, ConfigError};
 
 /// What a shell sees when the user pressed Ctrl-C.
 const INTERRUPTED: u8 = 130;
@@ -114,7 +114,8 @@ fn code_from(result: anyhow::Result<Ended>) -> ExitCode {
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
             console::print_error(&error);
-            if error.downcast_ref::<UsageError>().is_some() { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
+            let of_usage = error.downcast_ref::<UsageError>().is_some() || matches!(error.downcast_ref(), Some(ConfigError::Set { .. }));
+            if of_usage { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
         }
     }
 }

@@ -40,7 +40,7 @@ impl Durations {
 
     /// The duration that `share` (0–1) of all do not exceed, ms; 0 when there are none.
     pub fn quantile_ms(&self, share: f64) -> f64 {
-        if self.histogram.is_empty() { 0.0 } else { self.histogram.value_at_quantile(share) as f64 * 1e-6 }
+        if self.histogram.is_empty() { 0.0 } else { ms_from_ns(self.histogram.value_at_quantile(share)) }
     }
 
     /// Count, percentiles and maximum.
@@ -51,9 +51,14 @@ impl Durations {
             p95_ms: self.quantile_ms(0.95),
             p99_ms: self.quantile_ms(0.99),
             p999_ms: self.quantile_ms(0.999),
-            max_ms: self.histogram.max() as f64 * 1e-6,
+            max_ms: ms_from_ns(self.histogram.max()),
         }
     }
+}
+
+/// To a microsecond: the histogram knows no finer.
+fn ms_from_ns(ns: u64) -> f64 {
+    (ns as f64 * 1e-3).round() * 1e-3
 }
 
 /// A distribution of durations in six figures.

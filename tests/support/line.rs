@@ -98,21 +98,28 @@ pub fn adding(name: &'static str, levels: u8) -> Box<dyn Stage> {
     })
 }
 
+/// A frame's number and its picture's bytes.
+#[derive(PartialEq)]
+pub struct SeenFrame {
+    pub id: u64,
+    pub bytes: Vec<u8>,
+}
+
 /// What a sink has seen.
 #[derive(Clone, Default)]
 pub struct Seen {
-    pub frames: Arc<Mutex<Vec<(u64, Vec<u8>)>>>,
+    pub frames: Arc<Mutex<Vec<SeenFrame>>>,
     pub finished: Arc<Mutex<u32>>,
 }
 
 impl Seen {
     pub fn ids(&self) -> Vec<u64> {
-        self.frames.lock().unwrap().iter().map(|(id, _)| *id).collect()
+        self.frames.lock().unwrap().iter().map(|frame| frame.id).collect()
     }
 
     /// The level of each frame's first pixel.
     pub fn levels(&self) -> Vec<u8> {
-        self.frames.lock().unwrap().iter().map(|(_, bytes)| bytes[0]).collect()
+        self.frames.lock().unwrap().iter().map(|frame| frame.bytes[0]).collect()
     }
 
     pub fn finished(&self) -> u32 {
@@ -160,7 +167,7 @@ impl Sink for Keeping {
         if self.fail_at == Some(frame.id.0) {
             return Err(SinkError("the disk is full".to_owned()));
         }
-        self.seen.frames.lock().unwrap().push((frame.id.0, frame.image.as_bytes().to_vec()));
+        self.seen.frames.lock().unwrap().push(SeenFrame { id: frame.id.0, bytes: frame.image.as_bytes().to_vec() });
         Ok(())
     }
 
