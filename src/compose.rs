@@ -13,7 +13,10 @@ use crate::recording::folder::Recording;
 use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::color_normalization::color_file::ColorFile;
 use crate::stages::color_normalization::stage::ColorNormalization;
+use crate::stages::pose_refinement::PoseRefinement;
 use crate::stages::pose_stamping::PoseStamping;
+use crate::stages::specularity_detection::SpecularityDetection;
+use crate::stages::specularity_substitution::stage::SpecularitySubstitution;
 use crate::stages::temporal_median::stage::TemporalMedian;
 use crate::stages::undistortion::{self, Undistortion};
 use crate::stages::{color_normalization, temporal_median};
@@ -162,27 +165,37 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
         Some("no light field (--light-field LF)")
     } else if recording.camera.is_none() {
         Some("no camera.yaml beside the video")
-    } else if recording.trajectory.is_none() {
-        Some("no poses.tum beside the video")
-    } else if recording.hand_eye.is_none() {
-        Some("no hand_eye.yaml beside the video")
     } else if !wanted.contains(&Choice::Undistort) {
         Some("the light field's pictures are undistorted and the video's are not to be (add undistort to --stages)")
     } else {
         None
     };
-    if let Some(lacking) = lacking {
-        line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
-    }
-    if let (None, Some(light_field), Some(trajectory), Some(hand_eye)) =
-        (lacking, &equipment.light_field, &recording.trajectory, &recording.hand_eye)
-    {
-        let poses = PoseBuffer::from_trajectory(trajectory, &config.poses)?;
-        let mut stamping = PoseStamping::new(poses, hand_eye.clone());
-        if hand_eye.time_offset.is_none() && light_field.time_offset != Span(0) {
-            stamping = stamping.with_time_offset(light_field.time_offset);
+    line.stages.push(Box::new(SpecularityDetection::new(&config.specularity)));
+    let Some(light_field) = equipment.light_field.as_ref().filter(|_| lacking.is_none()) else {
+        if let Some(lacking) = lacking {
+            line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
         }
-        line.stages.push(Box::new(stamping));
+        line.stages.push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
+        return Ok(());
+    };
+    match (&recording.trajectory, &recording.hand_eye) {
+        (Some(trajectory), Some(hand_eye)) => {
+            let poses = PoseBuffer::from_trajectory(trajectory, &config.poses)?;
+            let mut stamping = PoseStamping::new(poses, hand_eye.clone());
+            if hand_eye.time_offset.is_none() && light_field.time_offset != Span(0) {
+                stamping = stamping.with_time_offset(light_field.time_offset);
+            }
+            line.stages.push(Box::new(stamping));
+        }
+        (trajectory, _) => {
+            let missing = if trajectory.is_none() { "poses.tum" } else { "hand_eye.yaml" };
+            line.leave_out(
+                Choice::Specular,
+                format!("no {missing} beside the video, so the camera is looked for in the picture alone"),
+            );
+        }
     }
+    line.stages.push(Box::new(PoseRefinement::new(&config.pose_refinement, Arc::clone(light_field))));
+    line.stages.push(Box::new(SpecularitySubstitution::new(&config.substitution, Some(Arc::clone(light_field)))));
     Ok(())
 }

@@ -9,9 +9,9 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
-use crate::image::field_of_view;
+use crate::image::{field_of_view, specularity};
 use crate::robot::pose_buffer::{self, PoseBuffer};
-use crate::stages::{color_normalization, temporal_median, undistortion};
+use crate::stages::{color_normalization, pose_refinement, specularity_substitution, temporal_median, undistortion};
 
 /// One `key=value` of `--set`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -120,8 +120,14 @@ pub struct Config {
     pub color: color_normalization::settings::Settings,
     /// Undistortion.
     pub undistort: undistortion::Settings,
+    /// What counts as a specularity, and what as steel.
+    pub specularity: specularity::Settings,
     /// The arm's poses between its samples.
     pub poses: pose_buffer::Settings,
+    /// The arm's pose corrected by the picture.
+    pub pose_refinement: pose_refinement::Settings,
+    /// How specularities are replaced.
+    pub substitution: specularity_substitution::stage::Settings,
     /// How the endoscope's image field is looked for.
     pub field_of_view: field_of_view::Settings,
 }

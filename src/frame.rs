@@ -54,7 +54,9 @@ pub struct Provenance {
 /// What the light field had to say about a frame, in figures.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Alignment {
-    /// Root mean square residual of the picture against the light field after alignment, gray levels.
+    /// How well the picture's detail agrees with the light field's, −1…1.
+    pub correlation: f32,
+    /// Root mean square residual of the picture against the light field around the filled regions, gray levels.
     pub residual_levels: f32,
     /// How far the picture moved the arm's pose, px at the scene, median over the picture.
     pub correction_px: f32,

@@ -2,13 +2,18 @@
 #![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
 
 mod architecture;
+mod camera;
+mod recording;
+mod robot;
+mod undistortion;
+mod media;
 mod cli;
 mod color;
 mod config;
 mod determinism;
 mod light_field;
-mod media;
 mod pipeline;
 mod support;
 mod temporal_median;
 mod survey;
+mod synthetic;

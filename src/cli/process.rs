@@ -15,7 +15,7 @@ use crate::config::Config;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::field_of_view;
 use crate::image::pool::Pool;
-use crate::light_field::build::{self, BuildSettings};
+use crate::light_field::build::{self as light_field_build, BuildSettings};
 use crate::media::reader::{Input, VideoReader};
 use crate::media::writer::{Output, Sound, VideoWriter, WriterSettings};
 use crate::pipeline::builder::Pipeline;
@@ -114,7 +114,7 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     let info = reader.info().clone();
     recording.check_video_size(info.width, info.height)?;
     let light_field = match &args.light_field {
-        Some(folder) => Some(Arc::new(build::open(folder, &BuildSettings::default(), &context.console)?)),
+        Some(folder) => Some(Arc::new(light_field_build::open(folder, &BuildSettings::default(), &context.console)?)),
         None => None,
     };
     let equipment = Equipment { recording: &recording, light_field, size: (info.width, info.height) };

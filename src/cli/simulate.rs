@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 
-use crate::cli::context::{Context, Ended};
+use crate::progress::Progress;
 use crate::synthetic::arm::ArmSettings;
 use crate::synthetic::organs::Anatomy;
-use crate::synthetic::simulation::{Settings, simulate};
+use crate::synthetic::simulation::{Settings, Subject, simulate};
 
 /// Make recordings of a simulated operation, with exact truth.
 #[derive(Debug, clap::Args)]
@@ -37,6 +37,15 @@ pub struct Args {
     /// Stroke of a heartbeat, mm (72 beats a minute).
     #[arg(long, default_value_t = 0.0)]
     heartbeat_mm: f64,
+    /// A steel grasper crosses the live recording.
+    #[arg(long)]
+    instrument: bool,
+    /// Particles in a frame of the live recording, on average.
+    #[arg(long, default_value_t = 0.0)]
+    particles: f64,
+    /// Optical depth of the thickest smoke in the live recording (1 = dense).
+    #[arg(long, default_value_t = 0.0)]
+    smoke: f64,
     /// Sensor noise; 1 = about one level.
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
@@ -55,6 +64,9 @@ pub struct Args {
     /// Fill the whole picture instead of a round field.
     #[arg(long)]
     full_frame: bool,
+    /// Write into a folder that is not empty: the program's own `--force`, which `main` fills in.
+    #[arg(skip)]
+    pub force: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -63,6 +75,8 @@ enum Scene {
     Gall,
     /// Two liver lobes.
     Liver,
+    /// A checkerboard, 9x6 corners of 4 mm: waved before a still scope (survey), and still before a moving one (live).
+    Calibration,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -77,12 +91,16 @@ fn size_from_text(text: &str) -> Result<Size, String> {
 }
 
 /// Run it.
-pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
-    context.refuse_overwriting(&args.out)?;
+pub fn run(args: Args, progress: &dyn Progress) -> anyhow::Result<()> {
+    let occupied = args.out.read_dir().is_ok_and(|mut entries| entries.next().is_some());
+    if occupied && !args.force {
+        bail!("{} is not empty; name another folder or add --force", args.out.display());
+    }
     let settings = Settings {
-        anatomy: match args.scene {
-            Scene::Gall => Anatomy::GallBladder,
-            Scene::Liver => Anatomy::Liver,
+        subject: match args.scene {
+            Scene::Gall => Subject::Organs(Anatomy::GallBladder),
+            Scene::Liver => Subject::Organs(Anatomy::Liver),
+            Scene::Calibration => Subject::Board,
         },
         seed: args.seed,
         width: args.size.width,
@@ -99,10 +117,13 @@ pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
         breathing_mm: args.breathing_mm,
         heartbeat_mm: args.heartbeat_mm,
         noise: args.noise,
+        instrument: args.instrument,
+        particles_per_frame: args.particles,
+        smoke: args.smoke,
         field_radius: (!args.full_frame).then_some(0.47),
         ..Settings::default()
     };
-    let summary = simulate(&args.out, &settings, &context.console)
+    let summary = simulate(&args.out, &settings, progress)
         .with_context(|| format!("simulating into {}", args.out.display()))?;
     tracing::info!(
         frames = summary.frames,
@@ -110,5 +131,5 @@ pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
         mean_level = summary.mean_level,
         "simulated"
     );
-    Ok(Ended::Complete)
+    Ok(())
 }

@@ -89,6 +89,13 @@ impl<P: Copy> Image<P> {
         self.data.extend_from_slice(&other.data);
     }
 
+    /// Keep the first `width * height` pixels as an image of that size (a smaller image written into the front of a larger one).
+    pub fn crop_rows(&mut self, width: usize, height: usize) {
+        self.width = width;
+        self.height = height.min(self.data.len() / width.max(1));
+        self.data.truncate(self.width * self.height);
+    }
+
     /// Change the size, every pixel `value`; allocates only if it must grow.
     pub fn resize(&mut self, width: usize, height: usize, value: P) {
         self.width = width;

@@ -1,14 +1,18 @@
 //! Images: pixel buffers, their pool, and what is done to pixels without knowing what they show.
 
-mod remap_bicubic;
-mod remap_bilinear;
+pub mod blur;
 pub mod buffer;
 pub mod color;
+pub mod components;
 pub mod corners;
+pub mod distance;
 pub mod field_of_view;
 pub mod gradient;
 pub mod patch;
 pub mod pool;
 pub mod pyramid;
 pub mod remap;
+mod remap_bilinear;
+mod remap_bicubic;
+pub mod specularity;
 pub mod wide;

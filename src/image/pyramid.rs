@@ -70,6 +70,32 @@ pub fn halved(image: &Image<f32>) -> Image<f32> {
     out
 }
 
+/// Valid (255) only where the whole neighbourhood of `radius` px is.
+pub fn eroded(mask: &Mask, radius: usize) -> Mask {
+    let (width, height) = mask.size();
+    let mut across = Image::filled(width, height, 0);
+    for y in 0..height {
+        let row = mask.row(y);
+        for (x, out) in across.row_mut(y).iter_mut().enumerate() {
+            if row[x.saturating_sub(radius)..(x + radius + 1).min(width)]
+                .iter()
+                .all(|m| *m != 0)
+            {
+                *out = 255;
+            }
+        }
+    }
+    let mut out = Image::filled(width, height, 255);
+    for y in 0..height {
+        for v in y.saturating_sub(radius)..(y + radius + 1).min(height) {
+            for (out, m) in out.row_mut(y).iter_mut().zip(across.row(v)) {
+                *out &= *m;
+            }
+        }
+    }
+    out
+}
+
 /// Every second pixel, valid (255) only where its 3×3 neighbourhood is.
 pub fn halved_mask(mask: &Mask) -> Mask {
     let (width, height) = (mask.width().div_ceil(2), mask.height().div_ceil(2));
@@ -110,6 +136,9 @@ mod tests {
     fn an_invalid_pixel_spoils_its_coarse_neighbours_only() {
         let mut mask = Image::filled(16, 16, 255u8);
         mask.set(7, 6, 0);
+        let worn = eroded(&mask, 2);
+        assert_eq!(worn.pixels().iter().filter(|m| **m == 0).count(), 25);
+        assert!((5..=9).all(|x| (4..=8).all(|y| worn.at(x, y) == 0)));
         let half = halved_mask(&mask);
         let spoilt: Vec<_> = (0..8)
             .flat_map(|y| (0..8).map(move |x| (x, y)))

@@ -55,7 +55,11 @@ pub struct ColmapModel {
 pub fn model_folder(folder: &Path) -> Option<PathBuf> {
     [folder.join("sparse"), folder.join("sparse").join("0"), folder.to_path_buf()]
         .into_iter()
-        .find(|f| ["txt", "bin"].iter().any(|e| f.join(format!("cameras.{e}")).is_file() && f.join(format!("images.{e}")).is_file()))
+        .find(|f| {
+            ["txt", "bin"]
+                .iter()
+                .any(|e| f.join(format!("cameras.{e}")).is_file() && f.join(format!("images.{e}")).is_file())
+        })
 }
 
 /// Model name, COLMAP's number, count of parameters.
@@ -72,39 +76,72 @@ const MODELS: [(&str, i32, usize); 7] = [
 fn camera_model(name: &str, width: usize, height: usize, p: &[f64]) -> Result<CameraModel, String> {
     let known = || MODELS.map(|(n, ..)| n).join(", ");
     let &(_, _, count) = MODELS.iter().find(|(n, ..)| *n == name).ok_or_else(|| {
-        format!("the camera model {name} is unknown here; expected one of {} (COLMAP's image_undistorter makes PINHOLE)", known())
+        format!(
+            "the camera model {name} is unknown here; expected one of {} (COLMAP's image_undistorter makes PINHOLE)",
+            known()
+        )
     })?;
     if p.len() != count || !p.iter().all(|v| v.is_finite()) {
         return Err(format!("expected {count} finite parameters for {name}, found {}", p.len()));
     }
     if width == 0 || height == 0 || p[0] <= 0.0 {
-        return Err(format!("expected a picture size and a focal length above 0, found {width}×{height} and {}", p[0]));
+        return Err(format!(
+            "expected a picture size and a focal length above 0, found {width}×{height} and {}",
+            p[0]
+        ));
     }
     let one_focal = matches!(name, "SIMPLE_PINHOLE" | "SIMPLE_RADIAL" | "RADIAL");
-    let (fx, fy, rest) = if one_focal { (p[0], p[0], &p[1..]) } else { (p[0], p[1], &p[2..]) };
-    let intrinsics = Intrinsics { fx, fy, cx: rest[0] - 0.5, cy: rest[1] - 0.5 };
+    let (fx, fy, rest) = if one_focal {
+        (p[0], p[0], &p[1..])
+    } else {
+        (p[0], p[1], &p[2..])
+    };
+    let intrinsics = Intrinsics {
+        fx,
+        fy,
+        cx: rest[0] - 0.5,
+        cy: rest[1] - 0.5,
+    };
     let lens = &rest[2..];
     let distortion = match name {
-        "SIMPLE_RADIAL" => Distortion::BrownConrady { k: [lens[0], 0.0, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] },
-        "RADIAL" => Distortion::BrownConrady { k: [lens[0], lens[1], 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] },
-        "OPENCV" => Distortion::BrownConrady { k: [lens[0], lens[1], 0.0, 0.0, 0.0, 0.0], p: [lens[2], lens[3]] },
+        "SIMPLE_RADIAL" => Distortion::BrownConrady {
+            k: [lens[0], 0.0, 0.0, 0.0, 0.0, 0.0],
+            p: [0.0; 2],
+        },
+        "RADIAL" => Distortion::BrownConrady {
+            k: [lens[0], lens[1], 0.0, 0.0, 0.0, 0.0],
+            p: [0.0; 2],
+        },
+        "OPENCV" => Distortion::BrownConrady {
+            k: [lens[0], lens[1], 0.0, 0.0, 0.0, 0.0],
+            p: [lens[2], lens[3]],
+        },
         "FULL_OPENCV" => Distortion::BrownConrady {
             k: [lens[0], lens[1], lens[4], lens[5], lens[6], lens[7]],
             p: [lens[2], lens[3]],
         },
-        "OPENCV_FISHEYE" => Distortion::KannalaBrandt { k: [lens[0], lens[1], lens[2], lens[3]] },
+        "OPENCV_FISHEYE" => Distortion::KannalaBrandt {
+            k: [lens[0], lens[1], lens[2], lens[3]],
+        },
         _ => Distortion::None,
     };
     // A lens whose coefficients are all zero is a pinhole, and needs no undistortion.
     let straight = lens.iter().all(|&v| v == 0.0) && name != "OPENCV_FISHEYE";
-    Ok(CameraModel { width, height, intrinsics, distortion: if straight { Distortion::None } else { distortion } })
+    Ok(CameraModel {
+        width,
+        height,
+        intrinsics,
+        distortion: if straight { Distortion::None } else { distortion },
+    })
 }
 
 fn pose(q: [f64; 4], t: [f64; 3]) -> Result<Transform<World, Camera>, String> {
     let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
     let norm = quaternion.norm();
     if !norm.is_finite() || norm < 1e-6 || !t.iter().all(|v| v.is_finite()) {
-        return Err(format!("expected a pose of finite numbers and a quaternion of length 1, found {q:?} {t:?}"));
+        return Err(format!(
+            "expected a pose of finite numbers and a quaternion of length 1, found {q:?} {t:?}"
+        ));
     }
     Ok(Transform::<Camera, World>::new(UnitQuaternion::from_quaternion(quaternion), Vector3::from(t)).inverse())
 }
@@ -122,17 +159,26 @@ impl ColmapModel {
         let mut observed = BTreeMap::new();
         let fault = |path: &Path| {
             let path = path.to_path_buf();
-            move |what: String| LightFieldError::Corrupt { path, what: format!("{what}; export the model again") }
+            move |what: String| LightFieldError::Corrupt {
+                path,
+                what: format!("{what}; export the model again"),
+            }
         };
         if binary {
             model.read_binary_cameras(&bytes(&cameras)?).map_err(fault(&cameras))?;
-            model.read_binary_images(&bytes(&images)?, &mut observed).map_err(fault(&images))?;
+            model
+                .read_binary_images(&bytes(&images)?, &mut observed)
+                .map_err(fault(&images))?;
             if points.is_file() {
-                model.read_binary_points(&bytes(&points)?, &observed).map_err(fault(&points))?;
+                model
+                    .read_binary_points(&bytes(&points)?, &observed)
+                    .map_err(fault(&points))?;
             }
         } else {
             model.read_text_cameras(&text(&cameras)?).map_err(fault(&cameras))?;
-            model.read_text_images(&text(&images)?, &mut observed).map_err(fault(&images))?;
+            model
+                .read_text_images(&text(&images)?, &mut observed)
+                .map_err(fault(&images))?;
             if points.is_file() {
                 model.read_text_points(&text(&points)?, &observed).map_err(fault(&points))?;
             }
@@ -140,7 +186,13 @@ impl ColmapModel {
         model.images.sort_by_key(|image| image.id);
         for image in &model.images {
             if !model.cameras.contains_key(&image.camera_id) {
-                return Err(LightFieldError::corrupt(&images, format!("{} names camera {}, which cameras.{extension} lacks", image.name, image.camera_id)));
+                return Err(LightFieldError::corrupt(
+                    &images,
+                    format!(
+                        "{} names camera {}, which cameras.{extension} lacks",
+                        image.name, image.camera_id
+                    ),
+                ));
             }
         }
         Ok(model)
@@ -153,7 +205,8 @@ impl ColmapModel {
                 return Err(format!("expected `id MODEL width height parameters`, found `{line}`"));
             };
             let parameters: Vec<f64> = parameters.iter().map(|w| number(w)).collect::<Result<_, _>>()?;
-            self.cameras.insert(number(id)?, camera_model(name, number(width)?, number(height)?, &parameters)?);
+            self.cameras
+                .insert(number(id)?, camera_model(name, number(width)?, number(height)?, &parameters)?);
         }
         Ok(())
     }
@@ -177,7 +230,12 @@ impl ColmapModel {
                 world_from_camera: pose([v[0], v[1], v[2], v[3]], [v[4], v[5], v[6]])?,
             };
             let seen: Vec<&str> = lines.next().unwrap_or("").split_whitespace().collect();
-            let pixels = seen.chunks_exact(3).map(|c| Ok(Pixel { x: number::<f64>(c[0])? - 0.5, y: number::<f64>(c[1])? - 0.5 }));
+            let pixels = seen.chunks_exact(3).map(|c| {
+                Ok(Pixel {
+                    x: number::<f64>(c[0])? - 0.5,
+                    y: number::<f64>(c[1])? - 0.5,
+                })
+            });
             observed.insert(image.id, pixels.collect::<Result<_, String>>()?);
             self.images.push(image);
         }
@@ -205,8 +263,10 @@ impl ColmapModel {
         for _ in 0..bytes.u64()? {
             let (id, model) = (bytes.u32()?, bytes.u32()? as i32);
             let (width, height) = (bytes.u64()? as usize, bytes.u64()? as usize);
-            let &(name, _, count) =
-                MODELS.iter().find(|m| m.1 == model).ok_or_else(|| format!("camera model number {model} is unknown here"))?;
+            let &(name, _, count) = MODELS
+                .iter()
+                .find(|m| m.1 == model)
+                .ok_or_else(|| format!("camera model number {model} is unknown here"))?;
             let parameters: Vec<f64> = (0..count).map(|_| bytes.f64()).collect::<Result<_, _>>()?;
             self.cameras.insert(id, camera_model(name, width, height, &parameters)?);
         }
@@ -224,11 +284,19 @@ impl ColmapModel {
             let count = bytes.u64()?;
             let mut pixels = Vec::new();
             for _ in 0..count {
-                pixels.push(Pixel { x: bytes.f64()? - 0.5, y: bytes.f64()? - 0.5 });
+                pixels.push(Pixel {
+                    x: bytes.f64()? - 0.5,
+                    y: bytes.f64()? - 0.5,
+                });
                 bytes.u64()?;
             }
             observed.insert(id, pixels);
-            self.images.push(ColmapImage { id, name, camera_id, world_from_camera: pose(q, t)? });
+            self.images.push(ColmapImage {
+                id,
+                name,
+                camera_id,
+                world_from_camera: pose(q, t)?,
+            });
         }
         Ok(())
     }
@@ -255,7 +323,17 @@ impl ColmapModel {
         let mut cameras = String::from("# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[] (fx fy cx cy; pixel centres at 0.5)\n");
         for (id, camera) in &self.cameras {
             let k = &camera.intrinsics;
-            writeln!(cameras, "{id} PINHOLE {} {} {} {} {} {}", camera.width, camera.height, k.fx, k.fy, k.cx + 0.5, k.cy + 0.5).ok();
+            writeln!(
+                cameras,
+                "{id} PINHOLE {} {} {} {} {} {}",
+                camera.width,
+                camera.height,
+                k.fx,
+                k.fy,
+                k.cx + 0.5,
+                k.cy + 0.5
+            )
+            .ok();
         }
         let mut seen: BTreeMap<u32, Vec<(Pixel, usize)>> = BTreeMap::new();
         let mut points = String::from("# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] (IMAGE_ID, POINT2D_IDX); mm\n");
@@ -269,7 +347,9 @@ impl ColmapModel {
             }
             points.push('\n');
         }
-        let mut images = String::from("# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (camera from world, mm)\n# POINTS2D[] (X, Y, POINT3D_ID)\n");
+        let mut images = String::from(
+            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME (camera from world, mm)\n# POINTS2D[] (X, Y, POINT3D_ID)\n",
+        );
         for image in &self.images {
             let pose = image.world_from_camera.inverse();
             let (q, t) = (pose.rotation(), pose.translation());
@@ -303,7 +383,9 @@ fn observation(observed: &Observed, image: u32, index: u32) -> Option<(u32, Pixe
 }
 
 fn data_lines(text: &str) -> impl Iterator<Item = &str> {
-    text.lines().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#'))
+    text.lines()
+        .map(str::trim)
+        .filter(|line| !line.is_empty() && !line.starts_with('#'))
 }
 
 fn number<T: std::str::FromStr>(word: &str) -> Result<T, String> {
@@ -333,7 +415,9 @@ impl Bytes<'_> {
 
     fn name(&mut self) -> Result<String, String> {
         let end = self.0.iter().position(|&b| b == 0).ok_or("a name without an end")?;
-        let name = std::str::from_utf8(&self.0[..end]).map_err(|_| "a name that is not UTF-8")?.to_owned();
+        let name = std::str::from_utf8(&self.0[..end])
+            .map_err(|_| "a name that is not UTF-8")?
+            .to_owned();
         self.0 = &self.0[end + 1..];
         Ok(name)
     }
@@ -347,19 +431,45 @@ mod tests {
         let camera = CameraModel {
             width: 320,
             height: 240,
-            intrinsics: Intrinsics { fx: 300.25, fy: 299.5, cx: 159.125, cy: 119.0 },
+            intrinsics: Intrinsics {
+                fx: 300.25,
+                fy: 299.5,
+                cx: 159.125,
+                cy: 119.0,
+            },
             distortion: Distortion::None,
         };
-        let pose = |x: f64| Transform::new(UnitQuaternion::from_scaled_axis(Vector3::new(0.1, x, -0.2)), Vector3::new(x, 2.0, -3.0));
+        let pose = |x: f64| {
+            Transform::new(
+                UnitQuaternion::from_scaled_axis(Vector3::new(0.1, x, -0.2)),
+                Vector3::new(x, 2.0, -3.0),
+            )
+        };
         ColmapModel {
             cameras: BTreeMap::from([(1, camera)]),
             images: vec![
-                ColmapImage { id: 1, name: "000003.png".into(), camera_id: 1, world_from_camera: pose(0.5) },
-                ColmapImage { id: 2, name: "000007.png".into(), camera_id: 1, world_from_camera: pose(1.5) },
+                ColmapImage {
+                    id: 1,
+                    name: "000003.png".into(),
+                    camera_id: 1,
+                    world_from_camera: pose(0.5),
+                },
+                ColmapImage {
+                    id: 2,
+                    name: "000007.png".into(),
+                    camera_id: 1,
+                    world_from_camera: pose(1.5),
+                },
             ],
             points: vec![
-                ColmapPoint { position: Point::new(1.0, 2.0, 70.0), observations: vec![(2, Pixel { x: 10.0, y: 20.5 })] },
-                ColmapPoint { position: Point::new(3.0, 2.0, 70.0), observations: vec![] },
+                ColmapPoint {
+                    position: Point::new(1.0, 2.0, 70.0),
+                    observations: vec![(2, Pixel { x: 10.0, y: 20.5 })],
+                },
+                ColmapPoint {
+                    position: Point::new(3.0, 2.0, 70.0),
+                    observations: vec![],
+                },
             ],
         }
     }
@@ -385,8 +495,15 @@ mod tests {
         let cameras = fs::read_to_string(folder.path().join("cameras.txt")).unwrap();
         assert!(cameras.contains("1 PINHOLE 320 240 300.25 299.5 159.625 119.5"), "{cameras}");
         let images = fs::read_to_string(folder.path().join("images.txt")).unwrap();
-        let second: Vec<f64> =
-            images.lines().nth(2).unwrap().split(' ').skip(1).take(7).map(|w| w.parse().unwrap()).collect();
+        let second: Vec<f64> = images
+            .lines()
+            .nth(2)
+            .unwrap()
+            .split(' ')
+            .skip(1)
+            .take(7)
+            .map(|w| w.parse().unwrap())
+            .collect();
         let inverse = model().images[0].world_from_camera.inverse();
         assert!((second[0] - inverse.rotation().w).abs() < 1e-12 && (second[4] - inverse.translation().x).abs() < 1e-12);
         assert!(images.contains("10.5000 21.0000 1"), "{images}");
@@ -395,7 +512,13 @@ mod tests {
     #[test]
     fn lenses_are_read_and_unknown_ones_named() {
         let opencv = camera_model("OPENCV", 10, 10, &[9.0, 8.0, 5.0, 5.0, 0.1, 0.2, 0.3, 0.4]).unwrap();
-        assert_eq!(opencv.distortion, Distortion::BrownConrady { k: [0.1, 0.2, 0.0, 0.0, 0.0, 0.0], p: [0.3, 0.4] });
+        assert_eq!(
+            opencv.distortion,
+            Distortion::BrownConrady {
+                k: [0.1, 0.2, 0.0, 0.0, 0.0, 0.0],
+                p: [0.3, 0.4]
+            }
+        );
         assert_eq!(opencv.intrinsics.cx, 4.5);
         let simple = camera_model("SIMPLE_RADIAL", 10, 10, &[9.0, 5.0, 5.0, 0.1]).unwrap();
         assert_eq!((simple.intrinsics.fy, simple.intrinsics.cy), (9.0, 4.5));
@@ -435,6 +558,11 @@ mod tests {
         assert!((model.images[0].world_from_camera.translation() - Vector3::new(-1.0, -2.0, -3.0)).norm() < 1e-12);
         assert_eq!(model.cameras[&7].intrinsics.cx, 31.5);
         fs::write(folder.path().join("images.bin"), &images[..images.len() - 9]).unwrap();
-        assert!(ColmapModel::read(folder.path()).unwrap_err().to_string().contains("ends too early"));
+        assert!(
+            ColmapModel::read(folder.path())
+                .unwrap_err()
+                .to_string()
+                .contains("ends too early")
+        );
     }
 }

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::specularity::{Settings, SpecularityDetector};
 
 /// A pixel whose darkest channel rises this far above its surroundings shows the lamp: the mirror image adds white light.
 const RISE_LEVELS: f32 = 26.0;
@@ -28,10 +29,14 @@ pub fn confidence_of(image: &Image<Rgb8>, field: &Mask) -> Mask {
     let mut surroundings = box_mean(&dark, width, height, radius);
     let tamed: Vec<f32> = dark.iter().zip(&surroundings).map(|(&v, &s)| v.min(s + 6.0)).collect();
     surroundings = box_mean(&tamed, width, height, radius);
+    let (mut shining, mut steel) = (Image::filled(0, 0, 0), Image::filled(0, 0, 0));
+    SpecularityDetector::new(&Settings::default()).detect(image, Some(field), &mut shining, &mut steel);
     let mut silent: Vec<f32> = (0..dark.len())
         .map(|i| {
             let pixel = image.pixels()[i];
-            let specular = dark[i] > surroundings[i] + RISE_LEVELS || pixel.iter().all(|&v| v >= CLIPPED);
+            // What is replaced by a view must never be steel, and a view is one of many: either test silences it.
+            let marked = shining.pixels()[i] != 0 || steel.pixels()[i] != 0;
+            let specular = marked || dark[i] > surroundings[i] + RISE_LEVELS || pixel.iter().all(|&v| v >= CLIPPED);
             let outside = field.pixels()[i] == 0 || pixel.iter().all(|&v| v < BLACK);
             if specular || outside { 0.0 } else { 1e6 }
         })

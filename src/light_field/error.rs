@@ -14,7 +14,9 @@ pub enum LightFieldError {
         source: std::io::Error,
     },
     /// A folder without a COLMAP model.
-    #[error("{0}: expected a light field or a COLMAP model (cameras and images, .txt or .bin, in sparse/, sparse/0/ or the folder itself), found none; make one with `endofield light-field build RECORDING -o LF`")]
+    #[error(
+        "{0}: expected a light field or a COLMAP model (cameras and images, .txt or .bin, in sparse/, sparse/0/ or the folder itself), found none; make one with `endofield light-field build RECORDING -o LF`"
+    )]
     NotALightField(PathBuf),
     /// A picture that the model names is not there.
     #[error("{path}: the light field names this picture, but it is not there; copy it back, or build the light field again")]
@@ -31,7 +33,9 @@ pub enum LightFieldError {
         what: String,
     },
     /// A picture of another size than its camera's.
-    #[error("{path}: expected {expected_width}×{expected_height} pixels as the camera says, found {width}×{height}; rescale the pictures or mend cameras.txt")]
+    #[error(
+        "{path}: expected {expected_width}×{expected_height} pixels as the camera says, found {width}×{height}; rescale the pictures or mend cameras.txt"
+    )]
     WrongSize {
         /// The picture.
         path: PathBuf,
@@ -61,6 +65,9 @@ impl LightFieldError {
 
     /// A file that makes no sense.
     pub(crate) fn corrupt(path: &Path, what: impl Into<String>) -> Self {
-        Self::Corrupt { path: path.to_path_buf(), what: what.into() }
+        Self::Corrupt {
+            path: path.to_path_buf(),
+            what: what.into(),
+        }
     }
 }

@@ -78,22 +78,35 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
     let sparse = model_folder(folder).ok_or_else(|| LightFieldError::NotALightField(folder.to_path_buf()))?;
     let model = ColmapModel::read(&sparse)?;
     if model.images.is_empty() {
-        return Err(LightFieldError::corrupt(&sparse, "expected at least one image in the model, found none"));
+        return Err(LightFieldError::corrupt(
+            &sparse,
+            "expected at least one image in the model, found none",
+        ));
     }
     let manifest_path = folder.join("light_field.toml");
     let manifest: Option<Manifest> = if manifest_path.is_file() {
         let text = fs::read_to_string(&manifest_path).map_err(LightFieldError::io(&manifest_path))?;
         Some(toml::from_str(&text).map_err(|e| LightFieldError::corrupt(&manifest_path, e.to_string()))?)
     } else {
-        tracing::warn!("{}: no light_field.toml; taken as a COLMAP model, its unit as mm", folder.display());
+        tracing::warn!(
+            "{}: no light_field.toml; taken as a COLMAP model, its unit as mm",
+            folder.display()
+        );
         None
     };
-    let pictures = [folder.join("images"), folder.to_path_buf()].into_iter().find(|f| f.join(&model.images[0].name).is_file());
+    let pictures = [folder.join("images"), folder.to_path_buf()]
+        .into_iter()
+        .find(|f| f.join(&model.images[0].name).is_file());
     let pictures = pictures.unwrap_or_else(|| folder.join("images"));
-    let cameras: BTreeMap<u32, (CameraModel, Arc<CameraModel>)> =
-        model.cameras.iter().map(|(&id, camera)| (id, (camera.clone(), Arc::new(camera.pinhole())))).collect();
-    let by_name: BTreeMap<&str, &ManifestView> =
-        manifest.iter().flat_map(|m| m.views.iter().map(|v| (v.image.as_str(), v))).collect();
+    let cameras: BTreeMap<u32, (CameraModel, Arc<CameraModel>)> = model
+        .cameras
+        .iter()
+        .map(|(&id, camera)| (id, (camera.clone(), Arc::new(camera.pinhole()))))
+        .collect();
+    let by_name: BTreeMap<&str, &ManifestView> = manifest
+        .iter()
+        .flat_map(|m| m.views.iter().map(|v| (v.image.as_str(), v)))
+        .collect();
     progress.begin("reading the light field", model.images.len() as u64);
     let mut views = (model.images.par_iter().enumerate())
         .map(|(index, entry)| {
@@ -101,7 +114,11 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
             let about = by_name.get(entry.name.as_str()).copied();
             let view = read_view(folder, &pictures, entry, index, lens, pinhole, manifest.as_ref(), about)?;
             progress.advance(1);
-            if progress.stopping() { Err(LightFieldError::Stopped) } else { Ok(view) }
+            if progress.stopping() {
+                Err(LightFieldError::Stopped)
+            } else {
+                Ok(view)
+            }
         })
         .collect::<Result<Vec<View>, LightFieldError>>()?;
     progress.end();
@@ -110,7 +127,11 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
     let points = (model.points.into_iter())
         .map(|p| SparsePoint {
             position: p.position,
-            observations: p.observations.iter().filter_map(|(id, pixel)| Some((*frame_by_id.get(id)?, *pixel))).collect(),
+            observations: p
+                .observations
+                .iter()
+                .filter_map(|(id, pixel)| Some((*frame_by_id.get(id)?, *pixel)))
+                .collect(),
         })
         .collect();
     let surface_path = folder.join("surface.ply");
@@ -118,15 +139,36 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
         (_, true) => ply::read(&surface_path)?,
         (None, false) => Mesh::default(),
         (Some(_), false) => {
-            return Err(LightFieldError::corrupt(&surface_path, "expected the light field's surface, found no file; build the light field again"));
+            return Err(LightFieldError::corrupt(
+                &surface_path,
+                "expected the light field's surface, found no file; build the light field again",
+            ));
         }
     };
-    let origin = if manifest.is_some() { Origin::Endofield } else { Origin::Foreign };
+    let origin = if manifest.is_some() {
+        Origin::Endofield
+    } else {
+        Origin::Foreign
+    };
     let (time_offset, shading, recipe) = match manifest {
         Some(m) => (Span::from_seconds(m.time_offset_s), m.lamp, m.recipe),
-        None => (Span::default(), LampShading::default(), format!("COLMAP model {}", folder.display())),
+        None => (
+            Span::default(),
+            LampShading::default(),
+            format!("COLMAP model {}", folder.display()),
+        ),
     };
-    Ok(Loaded { light_field: LightField { views, surface, time_offset, points, shading, recipe }, origin })
+    Ok(Loaded {
+        light_field: LightField {
+            views,
+            surface,
+            time_offset,
+            points,
+            shading,
+            recipe,
+        },
+        origin,
+    })
 }
 
 #[expect(clippy::too_many_arguments, reason = "the parts of one folder, all named")]
@@ -182,34 +224,75 @@ pub fn save(light_field: &LightField, folder: &Path, progress: &dyn Progress) ->
     let mut model = ColmapModel::default();
     let mut id_by_frame = BTreeMap::new();
     for (index, view) in light_field.views.iter().enumerate() {
-        let known = model.cameras.iter().find(|(_, camera)| **camera == *view.camera).map(|(&id, _)| id);
+        let known = model
+            .cameras
+            .iter()
+            .find(|(_, camera)| **camera == *view.camera)
+            .map(|(&id, _)| id);
         let camera_id = known.unwrap_or(model.cameras.len() as u32 + 1);
         model.cameras.entry(camera_id).or_insert_with(|| (*view.camera).clone());
         let id = index as u32 + 1;
         id_by_frame.insert(view.frame_number, id);
-        model.images.push(ColmapImage { id, name: name(view), camera_id, world_from_camera: view.world_from_camera });
+        model.images.push(ColmapImage {
+            id,
+            name: name(view),
+            camera_id,
+            world_from_camera: view.world_from_camera,
+        });
     }
     model.points = (light_field.points.iter())
         .map(|p| ColmapPoint {
             position: p.position,
-            observations: p.observations.iter().filter_map(|(frame, pixel)| Some((*id_by_frame.get(frame)?, *pixel))).collect(),
+            observations: p
+                .observations
+                .iter()
+                .filter_map(|(frame, pixel)| Some((*id_by_frame.get(frame)?, *pixel)))
+                .collect(),
         })
         .collect();
     model.write_text(&folder.join("sparse"))?;
-    let deepest = light_field.views.iter().flat_map(|v| v.depth.pixels()).copied().fold(0.0_f32, f32::max);
+    let deepest = light_field
+        .views
+        .iter()
+        .flat_map(|v| v.depth.pixels())
+        .copied()
+        .fold(0.0_f32, f32::max);
     let depth_step_mm = DEPTH_STEP_MM.max(deepest / DEEPEST_STEP);
     progress.begin("writing the light field", light_field.views.len() as u64);
     light_field.views.par_iter().try_for_each(|view| {
         let file = |part: &str| folder.join(part).join(name(view));
         write_png(&file("images"), view.image.as_bytes(), view.image.size(), ColorType::Rgb8)?;
-        write_png(&file("confidence"), view.confidence.pixels(), view.confidence.size(), ColorType::L8)?;
-        let steps: Vec<u16> = view.depth.pixels().iter().map(|z| (z / depth_step_mm).round().clamp(0.0, 65535.0) as u16).collect();
-        write_png(&file("depth"), bytemuck::cast_slice(&steps), view.depth.size(), ColorType::L16)?;
+        write_png(
+            &file("confidence"),
+            view.confidence.pixels(),
+            view.confidence.size(),
+            ColorType::L8,
+        )?;
+        let steps: Vec<u16> = view
+            .depth
+            .pixels()
+            .iter()
+            .map(|z| (z / depth_step_mm).round().clamp(0.0, 65535.0) as u16)
+            .collect();
+        write_png(
+            &file("depth"),
+            bytemuck::cast_slice(&steps),
+            view.depth.size(),
+            ColorType::L16,
+        )?;
         progress.advance(1);
-        if progress.stopping() { Err(LightFieldError::Stopped) } else { Ok(()) }
+        if progress.stopping() {
+            Err(LightFieldError::Stopped)
+        } else {
+            Ok(())
+        }
     })?;
     progress.end();
-    ply::write(&light_field.surface, &folder.join("surface.ply"), PlyEncoding::BinaryLittleEndian)?;
+    ply::write(
+        &light_field.surface,
+        &folder.join("surface.ply"),
+        PlyEncoding::BinaryLittleEndian,
+    )?;
     let manifest = Manifest {
         format: 1,
         unit: "mm".into(),
@@ -219,7 +302,12 @@ pub fn save(light_field: &LightField, folder: &Path, progress: &dyn Progress) ->
         depth_step_mm,
         lamp: light_field.shading,
         views: (light_field.views.iter())
-            .map(|v| ManifestView { frame: v.frame_number, image: name(v), gain: v.gain, exposed_at_s: v.exposed_at.seconds() })
+            .map(|v| ManifestView {
+                frame: v.frame_number,
+                image: name(v),
+                gain: v.gain,
+                exposed_at_s: v.exposed_at.seconds(),
+            })
             .collect(),
     };
     let path = folder.join("light_field.toml");
@@ -249,10 +337,16 @@ pub fn write_mask(path: &Path, mask: &Mask) -> Result<(), LightFieldError> {
 
 fn decode(path: &Path) -> Result<DynamicImage, LightFieldError> {
     if !path.is_file() {
-        return Err(LightFieldError::MissingImage { path: path.to_path_buf() });
+        return Err(LightFieldError::MissingImage {
+            path: path.to_path_buf(),
+        });
     }
-    let reader = ImageReader::open(path).and_then(ImageReader::with_guessed_format).map_err(LightFieldError::io(path))?;
-    reader.decode().map_err(|e| LightFieldError::corrupt(path, format!("expected a picture, found none that can be decoded ({e})")))
+    let reader = ImageReader::open(path)
+        .and_then(ImageReader::with_guessed_format)
+        .map_err(LightFieldError::io(path))?;
+    reader
+        .decode()
+        .map_err(|e| LightFieldError::corrupt(path, format!("expected a picture, found none that can be decoded ({e})")))
 }
 
 fn rgb(path: &Path) -> Result<Image<Rgb8>, LightFieldError> {
@@ -265,7 +359,8 @@ fn rgb(path: &Path) -> Result<Image<Rgb8>, LightFieldError> {
 fn gray(path: &Path) -> Result<Mask, LightFieldError> {
     let decoded = decode(path)?.into_luma8();
     let (width, height) = decoded.dimensions();
-    Image::from_vec(width as usize, height as usize, decoded.into_raw()).ok_or_else(|| LightFieldError::corrupt(path, "odd picture size"))
+    Image::from_vec(width as usize, height as usize, decoded.into_raw())
+        .ok_or_else(|| LightFieldError::corrupt(path, "odd picture size"))
 }
 
 fn depth(path: &Path, step_mm: f32) -> Result<Image<f32>, LightFieldError> {
@@ -280,7 +375,13 @@ fn right_size(path: &Path, (width, height): (usize, usize), camera: &CameraModel
         return Ok(());
     }
     let path: PathBuf = path.to_path_buf();
-    Err(LightFieldError::WrongSize { path, expected_width: camera.width, expected_height: camera.height, width, height })
+    Err(LightFieldError::WrongSize {
+        path,
+        expected_width: camera.width,
+        expected_height: camera.height,
+        width,
+        height,
+    })
 }
 
 /// The last run of digits in a file's name.

@@ -136,9 +136,15 @@ pub fn read<Space>(path: &Path) -> Result<Mesh<Space>, LightFieldError> {
 
 fn parse<Space>(bytes: &[u8]) -> Result<Mesh<Space>, String> {
     let end = b"end_header";
-    let at = (bytes.windows(end.len()).position(|w| w == end)).ok_or("expected a PLY header, found none; export the mesh again")?;
+    let at =
+        (bytes.windows(end.len()).position(|w| w == end)).ok_or("expected a PLY header, found none; export the mesh again")?;
     let header = std::str::from_utf8(&bytes[..at]).map_err(|_| "expected a PLY header in ASCII, found binary data")?;
-    let line_end = bytes[at..].iter().position(|&b| b == b'\n').ok_or("the PLY header has no end")? + at + 1;
+    let line_end = bytes[at..]
+        .iter()
+        .position(|&b| b == b'\n')
+        .ok_or("the PLY header has no end")?
+        + at
+        + 1;
     let mut elements: Vec<Element> = Vec::new();
     let mut ascii = None;
     if !header.starts_with("ply") {
@@ -153,22 +159,42 @@ fn parse<Space>(bytes: &[u8]) -> Result<Mesh<Space>, String> {
             ["format", other, ..] => return Err(format!("expected ascii or binary_little_endian, found {other}")),
             ["element", name, count] => elements.push(Element {
                 name: name.to_owned(),
-                count: count.parse().map_err(|_| format!("expected a count of {name}, found `{count}`"))?,
+                count: count
+                    .parse()
+                    .map_err(|_| format!("expected a count of {name}, found `{count}`"))?,
                 properties: Vec::new(),
             }),
             ["property", "list", count, item, _] => {
-                let list = Property::List { count: kind(count)?, kind: kind(item)? };
-                elements.last_mut().ok_or("a property before any element")?.properties.push(list);
+                let list = Property::List {
+                    count: kind(count)?,
+                    kind: kind(item)?,
+                };
+                elements
+                    .last_mut()
+                    .ok_or("a property before any element")?
+                    .properties
+                    .push(list);
             }
             ["property", item, name] => {
-                let scalar = Property::Scalar { name: name.to_owned(), kind: kind(item)? };
-                elements.last_mut().ok_or("a property before any element")?.properties.push(scalar);
+                let scalar = Property::Scalar {
+                    name: name.to_owned(),
+                    kind: kind(item)?,
+                };
+                elements
+                    .last_mut()
+                    .ok_or("a property before any element")?
+                    .properties
+                    .push(scalar);
             }
             _ => {}
         }
     }
     let mut body = match ascii.ok_or("the PLY header has no format line")? {
-        true => Body::Ascii(std::str::from_utf8(&bytes[line_end..]).map_err(|_| "expected ASCII numbers")?.split_ascii_whitespace()),
+        true => Body::Ascii(
+            std::str::from_utf8(&bytes[line_end..])
+                .map_err(|_| "expected ASCII numbers")?
+                .split_ascii_whitespace(),
+        ),
         false => Body::Binary(&bytes[line_end..]),
     };
     let mut mesh = Mesh::default();
@@ -200,7 +226,8 @@ fn parse<Space>(bytes: &[u8]) -> Result<Mesh<Space>, String> {
                 }
                 "vertex" => return Err(format!("vertex {} has no finite x, y, z", mesh.vertices.len())),
                 "face" if polygon.len() >= 3 => {
-                    mesh.triangles.extend(polygon.windows(2).skip(1).map(|pair| [polygon[0], pair[0], pair[1]]));
+                    mesh.triangles
+                        .extend(polygon.windows(2).skip(1).map(|pair| [polygon[0], pair[0], pair[1]]));
                 }
                 _ => {}
             }

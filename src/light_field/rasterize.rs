@@ -132,7 +132,12 @@ mod tests {
         CameraModel {
             width: 64,
             height: 48,
-            intrinsics: Intrinsics { fx: 60.0, fy: 58.0, cx: 31.0, cy: 24.5 },
+            intrinsics: Intrinsics {
+                fx: 60.0,
+                fy: 58.0,
+                cx: 31.0,
+                cy: 24.5,
+            },
             distortion: Distortion::None,
         }
     }

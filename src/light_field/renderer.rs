@@ -142,7 +142,8 @@ impl Renderer {
         valid: &mut Mask,
     ) {
         let mut depth = std::mem::replace(&mut self.depth, Image::filled(0, 0, 0.0));
-        self.rasterizer.render(&light_field.surface, camera, world_from_camera, &mut depth);
+        self.rasterizer
+            .render(&light_field.surface, camera, world_from_camera, &mut depth);
         self.render_on_depth(light_field, camera, world_from_camera, &depth, out, valid);
         self.depth = depth;
     }
@@ -169,7 +170,9 @@ impl Renderer {
         for top in (0..height).step_by(BLOCK) {
             for left in (0..width).step_by(BLOCK) {
                 let (right, bottom) = ((left + BLOCK).min(width), (top + BLOCK).min(height));
-                let Some((x, y)) = known_pixel(depth, left, top, right, bottom) else { continue };
+                let Some((x, y)) = known_pixel(depth, left, top, right, bottom) else {
+                    continue;
+                };
                 self.rank(&(eye + rotation * ray(x, y) * depth.at(x, y)), &eye, &mut ranked);
                 for y in top..bottom {
                     for x in left..right {
@@ -262,8 +265,19 @@ impl Renderer {
                 continue;
             }
             let (penalty, distance) = source.penalty(point, &from_eye, eye_distance);
-            let log_brightness = if self.shading.is_flat() { 0.0 } else { self.shading.log_brightness(distance, u * u + v * v) };
-            let new = Heard { penalty, weight: confidence * (border / FEATHER_PX).min(1.0), view: index, x, y, log_brightness };
+            let log_brightness = if self.shading.is_flat() {
+                0.0
+            } else {
+                self.shading.log_brightness(distance, u * u + v * v)
+            };
+            let new = Heard {
+                penalty,
+                weight: confidence * (border / FEATHER_PX).min(1.0),
+                view: index,
+                x,
+                y,
+                log_brightness,
+            };
             // Insertion into the short list, least penalty first; the last place gives the threshold only.
             let mut place = count.min(BLENDED);
             if count > BLENDED && heard[BLENDED].penalty <= penalty {
@@ -281,15 +295,27 @@ impl Renderer {
         }
         let spoken = count.min(BLENDED);
         // With k views or fewer nobody is pushed out, and the threshold only has to lie beyond the last.
-        let threshold = if count > BLENDED { heard[BLENDED].penalty } else { heard[spoken - 1].penalty * 1.5 };
-        let here = if self.shading.is_flat() { 0.0 } else { self.shading.log_brightness(eye_distance, rho2) };
+        let threshold = if count > BLENDED {
+            heard[BLENDED].penalty
+        } else {
+            heard[spoken - 1].penalty * 1.5
+        };
+        let here = if self.shading.is_flat() {
+            0.0
+        } else {
+            self.shading.log_brightness(eye_distance, rho2)
+        };
         let (mut sum, mut total, mut best, mut loudest) = ([0.0_f32; 3], 0.0, 0.0_f32, (0.0, heard[0].view));
         for voice in &heard[..spoken] {
             // ULR, section 5: w = max(0, 1 − penalty / threshold), with 1 / penalty for epipole consistency.
             let weight = voice.weight * ((1.0 - voice.penalty / threshold).max(0.0) + 1e-4) / voice.penalty;
             let source = &self.sources[voice.view];
             let color = bilinear_rgb(&light_field.views[voice.view].image, voice.x, voice.y);
-            let lamp = if voice.log_brightness == here { 1.0 } else { (here - voice.log_brightness).exp() };
+            let lamp = if voice.log_brightness == here {
+                1.0
+            } else {
+                (here - voice.log_brightness).exp()
+            };
             for channel in 0..3 {
                 sum[channel] += weight * lamp * source.gain[channel] * color[channel];
             }
@@ -299,7 +325,12 @@ impl Renderer {
                 loudest = (weight, voice.view);
             }
         }
-        (total > 0.0).then(|| Sample { color: sum.map(|v| v / total), weight: best, view: loudest.1, views: spoken })
+        (total > 0.0).then(|| Sample {
+            color: sum.map(|v| v / total),
+            weight: best,
+            view: loudest.1,
+            views: spoken,
+        })
     }
 }
 
@@ -309,7 +340,9 @@ fn known_pixel(depth: &Image<f32>, left: usize, top: usize, right: usize, bottom
     if depth.at(middle.0.min(right - 1), middle.1.min(bottom - 1)) > 0.0 {
         return Some((middle.0.min(right - 1), middle.1.min(bottom - 1)));
     }
-    (top..bottom).flat_map(|y| (left..right).map(move |x| (x, y))).find(|&(x, y)| depth.at(x, y) > 0.0)
+    (top..bottom)
+        .flat_map(|y| (left..right).map(move |x| (x, y)))
+        .find(|&(x, y)| depth.at(x, y) > 0.0)
 }
 
 /// Bilinear value at a place at least half a pixel inside the image.

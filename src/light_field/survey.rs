@@ -19,7 +19,7 @@ use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::corners::CornerChoice;
 use crate::image::gradient::gray_from_rgb;
-use crate::image::pyramid::{Pyramid, halved, halved_mask, smoothed};
+use crate::image::pyramid::{Pyramid, eroded, halved, halved_mask, smoothed};
 pub use crate::light_field::prior::PosePrior;
 use crate::light_field::prior::smoothed_pose;
 use crate::light_field::reobservation::{Feature, ReobservationChoice, reobserved};
@@ -170,6 +170,8 @@ const MIN_POINTS: usize = 20;
 const LEVELS: usize = 4;
 /// Residuals above this many robust standard deviations leave the adjustment.
 const OUTLIER_SIGMAS: f64 = 4.0;
+/// The priors stay this loose along the path, ms.
+const MIN_OFFSET_DOUBT_MS: f64 = 3.0;
 /// A reprojection error above this tells that the tissue moved, px.
 const RIGID_RMS_PX: f64 = 0.6;
 
@@ -452,7 +454,8 @@ impl<'a> Refinement<'a> {
         };
         let (mm, rad) = (self.prior.sigma_mm().max(1e-6), self.prior.sigma_rad().max(1e-8));
         let noise = Matrix6::from_diagonal(&Vector6::new(mm * mm, mm * mm, mm * mm, rad * rad, rad * rad, rad * rad));
-        let along = speed * self.offset.sigma_ms;
+        // Early estimates lean on priors taken at the wrong instant: never quite sure.
+        let along = speed * self.offset.sigma_ms.max(MIN_OFFSET_DOUBT_MS);
         let information = (noise + along * along.transpose()).try_inverse()?;
         Some(bundle_adjustment::PosePrior {
             mean: *pose.isometry(),
@@ -484,10 +487,9 @@ impl<'a> Refinement<'a> {
         .filter(|found| found.sigma_ms < 0.4 * self.settings.time_offset_doubt_ms);
         tracing::debug!(?found, "time offset");
         if let Some(found) = found {
-            // Early estimates lean on priors taken at the wrong instant: never surer than 3 ms.
             self.offset = TimeOffset {
                 offset: Span(found.offset.0 + start.0),
-                sigma_ms: found.sigma_ms.max(3.0),
+                sigma_ms: found.sigma_ms,
             };
             self.offset_found = true;
         }
@@ -675,7 +677,8 @@ fn working_pyramid(frame: &SurveyFrame, halvings: usize) -> Pyramid {
         valid = halved_mask(&valid);
     }
     // A little smoothing takes noise and the interpolation's own error out of the patches.
-    Pyramid::new(smoothed(&gray), valid, LEVELS)
+    // It carries what is masked two px farther, and interpolation one more.
+    Pyramid::new(smoothed(&gray), eroded(&valid, 3), LEVELS)
 }
 
 /// In front of all its views, and not absurdly near or far.

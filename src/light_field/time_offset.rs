@@ -4,6 +4,8 @@
 //! pictures know neither place nor scale); the shift that leaves the least difference is the offset. A camera that rests or moves evenly along a line
 //! fits at any shift: then the valley is flat, the standard deviation large, and the offset is reported as not observed.
 
+use rayon::prelude::*;
+
 use crate::geometry::alignment::{PosePair, Scale, Similarity};
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
@@ -34,46 +36,32 @@ pub(crate) fn estimate(
     if poses.len() < 8 {
         return None;
     }
-    let steps = (range_ms / STEP_MS).ceil().max(2.0) as i32;
-    let cost = |ms: f64| mismatch(poses, prior, smoothing_ms, Span::from_milliseconds(ms));
-    let costs: Vec<Option<f64>> = {
-        use rayon::prelude::*;
-        (-steps..=steps)
-            .into_par_iter()
-            .map(|k| cost(f64::from(k) * STEP_MS))
-            .collect()
+    let weights = Weights {
+        per_mm2: prior.sigma_mm().max(1e-9).powi(-2),
+        per_rad2: prior.sigma_rad().max(1e-9).powi(-2),
     };
+    let steps = (range_ms / STEP_MS).ceil().max(2.0) as i32;
+    let costs: Vec<Option<f64>> = (-steps..=steps)
+        .into_par_iter()
+        .map(|k| {
+            let offset = Span::from_milliseconds(f64::from(k) * STEP_MS);
+            mismatch(poses, weights, |at| smoothed_pose(prior, at - offset, smoothing_ms))
+        })
+        .collect();
     let (best, least) = costs
         .iter()
         .enumerate()
         .filter_map(|(i, c)| Some((i, (*c)?)))
         .min_by(|a, b| a.1.total_cmp(&b.1))?;
-    // A parabola through a few costs around the least, wide enough not to ride on noise.
-    let reach = 4;
-    if best < reach || best + reach >= costs.len() {
-        return None;
-    }
-    let (mut s0, mut s1, mut s2, mut s4, mut s2y) = (0.0, 0.0, 0.0, 0.0, 0.0);
-    let mut sy = 0.0;
-    for k in -(reach as i32)..=reach as i32 {
-        let y = costs[(best as i32 + k) as usize]?;
-        let x = f64::from(k);
-        s0 += 1.0;
-        s1 += x * y;
-        s2 += x * x;
-        s4 += x.powi(4);
-        sy += y;
-        s2y += x * x * y;
-    }
-    let curvature = (s0 * s2y - s2 * sy) / (s0 * s4 - s2 * s2);
-    let slope = s1 / s2;
-    if !(curvature > 0.0) {
-        return None;
-    }
-    let shift = (-0.5 * slope / curvature).clamp(-(reach as f64), reach as f64);
-    // Chi-square with 6 numbers a pose; its least value tells the true noise. ½·∂²χ²/∂τ² = 1/σ².
+    let shift = valley(&costs, best)?;
+    // The valley's own steepness would be that of the noise where the camera rests: the motion's is that of the pictures'
+    // path against itself, shifted. The least mismatch tells the arm's noise.
+    let shift_ms = 10.0 * STEP_MS;
+    let [later, earlier] =
+        [shift_ms, -shift_ms].map(|ms| mismatch(poses, weights, |at| interpolated(poses, at + Span::from_milliseconds(ms))));
+    let steepness = 0.5 * (later? + earlier?) / (shift_ms * shift_ms);
     let noise = (least / (6.0 * poses.len() as f64)).max(1e-12);
-    let sigma_ms = STEP_MS * (noise / curvature).sqrt();
+    let sigma_ms = (noise / steepness.max(1e-300)).sqrt();
     let offset_ms = (f64::from(best as i32 - steps) + shift) * STEP_MS;
     Some(TimeOffset {
         offset: Span::from_milliseconds(offset_ms),
@@ -81,21 +69,50 @@ pub(crate) fn estimate(
     })
 }
 
-/// Mean robust squared difference after the best similarity, times the number of poses.
+/// Where the bottom of the valley around `best` lies, in steps from it: of a parabola through a few costs to either side,
+/// wide enough not to ride on noise.
+fn valley(costs: &[Option<f64>], best: usize) -> Option<f64> {
+    const REACH: usize = 4;
+    let near = costs.get(best.checked_sub(REACH)?..=best + REACH)?;
+    let (mut s2, mut s4, mut sy, mut sxy, mut sxxy) = (0.0, 0.0, 0.0, 0.0, 0.0);
+    for (i, cost) in near.iter().enumerate() {
+        let (x, y) = (i as f64 - REACH as f64, (*cost)?);
+        s2 += x * x;
+        s4 += x.powi(4);
+        sy += y;
+        sxy += x * y;
+        sxxy += x * x * y;
+    }
+    let n = near.len() as f64;
+    let curvature = (n * sxxy - s2 * sy) / (n * s4 - s2 * s2);
+    (curvature > 0.0).then(|| (-0.5 * sxy / s2 / curvature).clamp(-(REACH as f64), REACH as f64))
+}
+
+/// The pictures' own path between its poses.
+fn interpolated(poses: &[(Timestamp, Transform<World, Camera>)], at: Timestamp) -> Option<Transform<World, Camera>> {
+    let i = poses.partition_point(|p| p.0 <= at);
+    let (a, b) = (poses.get(i.checked_sub(1)?)?, poses.get(i)?);
+    Some(a.1.interpolated(&b.1, (at - a.0).seconds() / (b.0 - a.0).seconds().max(1e-9)))
+}
+
+#[derive(Clone, Copy)]
+struct Weights {
+    per_mm2: f64,
+    per_rad2: f64,
+}
+
+/// Mean robust squared difference to the other path after the best similarity, times the number of poses.
 fn mismatch(
     poses: &[(Timestamp, Transform<World, Camera>)],
-    prior: &dyn PosePrior,
-    smoothing_ms: f64,
-    offset: Span,
+    weights: Weights,
+    other: impl Fn(Timestamp) -> Option<Transform<World, Camera>>,
 ) -> Option<f64> {
-    let per_mm2 = prior.sigma_mm().max(1e-9).powi(-2);
-    let per_rad2 = prior.sigma_rad().max(1e-9).powi(-2);
+    let Weights { per_mm2, per_rad2 } = weights;
     let mut pairs: Vec<PosePair> = poses
         .iter()
         .filter_map(|(at, pose)| {
-            let fixed = *smoothed_pose(prior, *at - offset, smoothing_ms)?.isometry();
             Some(PosePair {
-                fixed,
+                fixed: *other(*at)?.isometry(),
                 moving: *pose.isometry(),
                 per_mm2,
                 per_rad2,
@@ -105,33 +122,27 @@ fn mismatch(
     if pairs.len() * 10 < poses.len() * 8 {
         return None;
     }
-    let squares = |pairs: &[PosePair], gauge: &Similarity| -> Vec<f64> {
-        pairs
-            .iter()
-            .map(|p| {
-                let moved = gauge.moved(&p.moving);
-                let apart = (moved.translation.vector - p.fixed.translation.vector).norm_squared();
-                apart * per_mm2 + moved.rotation.angle_to(&p.fixed.rotation).powi(2) * per_rad2
-            })
-            .collect()
-    };
-    let mut found = Vec::new();
+    let mut squares: Vec<f64> = Vec::new();
     for _ in 0..3 {
         let gauge = Similarity::between(&pairs, Scale::Free)?;
-        found = squares(&pairs, &gauge);
-        let mut sorted = found.clone();
+        squares.clear();
+        squares.extend(pairs.iter().map(|p| {
+            let moved = gauge.moved(&p.moving);
+            let apart = (moved.translation.vector - p.fixed.translation.vector).norm_squared();
+            apart * per_mm2 + moved.rotation.angle_to(&p.fixed.rotation).powi(2) * per_rad2
+        }));
+        let mut sorted = squares.clone();
         sorted.sort_by(f64::total_cmp);
         let typical = sorted[sorted.len() / 2].max(1e-12);
-        for (pair, s) in pairs.iter_mut().zip(&found) {
+        for (pair, s) in pairs.iter_mut().zip(&squares) {
             let weight = 1.0 / (1.0 + s / (ROBUST_WIDTH * ROBUST_WIDTH * typical));
             pair.per_mm2 = per_mm2 * weight;
             pair.per_rad2 = per_rad2 * weight;
         }
     }
-    let mut sorted = found.clone();
-    sorted.sort_by(f64::total_cmp);
+    squares.sort_by(f64::total_cmp);
     // The worst tenth may be anything.
-    let kept = &sorted[..sorted.len() - sorted.len() / 10];
+    let kept = &squares[..squares.len() - squares.len() / 10];
     Some(kept.iter().sum::<f64>() / kept.len() as f64 * poses.len() as f64)
 }
 

@@ -15,7 +15,11 @@ pub fn undistorted(image: &Image<Rgb8>, camera: &CameraModel) -> (Image<Rgb8>, M
     if width < 4 || height < 4 {
         return (image.clone(), Image::filled(width, height, 255));
     }
-    (out.pixels_mut().par_chunks_mut(width).zip(field.pixels_mut().par_chunks_mut(width)).enumerate()).for_each(|(y, (row, mask))| {
+    (out.pixels_mut()
+        .par_chunks_mut(width)
+        .zip(field.pixels_mut().par_chunks_mut(width))
+        .enumerate())
+    .for_each(|(y, (row, mask))| {
         for x in 0..width {
             let (u, v) = camera.distortion.distort((x as f64 - k.cx) / k.fx, (y as f64 - k.cy) / k.fy);
             let (px, py) = (k.fx * u + k.cx, k.fy * v + k.cy);
@@ -30,7 +34,12 @@ pub fn undistorted(image: &Image<Rgb8>, camera: &CameraModel) -> (Image<Rgb8>, M
 
 fn keys(t: f32) -> [f32; 4] {
     let (t2, t3) = (t * t, t * t * t);
-    [-0.5 * t3 + t2 - 0.5 * t, 1.5 * t3 - 2.5 * t2 + 1.0, -1.5 * t3 + 2.0 * t2 + 0.5 * t, 0.5 * t3 - 0.5 * t2]
+    [
+        -0.5 * t3 + t2 - 0.5 * t,
+        1.5 * t3 - 2.5 * t2 + 1.0,
+        -1.5 * t3 + 2.0 * t2 + 0.5 * t,
+        0.5 * t3 - 0.5 * t2,
+    ]
 }
 
 fn bicubic(image: &Image<Rgb8>, x: f32, y: f32) -> Rgb8 {
@@ -61,14 +70,25 @@ mod tests {
         let camera = CameraModel {
             width: 80,
             height: 60,
-            intrinsics: Intrinsics { fx: 70.0, fy: 70.0, cx: 40.0, cy: 29.0 },
-            distortion: Distortion::BrownConrady { k: [-0.2, 0.05, 0.0, 0.0, 0.0, 0.0], p: [0.001, -0.001] },
+            intrinsics: Intrinsics {
+                fx: 70.0,
+                fy: 70.0,
+                cx: 40.0,
+                cy: 29.0,
+            },
+            distortion: Distortion::BrownConrady {
+                k: [-0.2, 0.05, 0.0, 0.0, 0.0, 0.0],
+                p: [0.001, -0.001],
+            },
         };
         // A ramp over the ideal coordinate, as the lens would show it.
         let mut bent = Image::filled(80, 60, [0_u8; 3]);
         for y in 0..60 {
             for x in 0..80 {
-                let ideal = camera.distortion.undistort((x as f64 - 40.0) / 70.0, (y as f64 - 29.0) / 70.0).unwrap();
+                let ideal = camera
+                    .distortion
+                    .undistort((x as f64 - 40.0) / 70.0, (y as f64 - 29.0) / 70.0)
+                    .unwrap();
                 let v = (ideal.0 * 70.0 + 40.0).clamp(0.0, 80.0) * 3.0;
                 bent.set(x, y, [v.round() as u8, 0, 0]);
             }
@@ -76,7 +96,11 @@ mod tests {
         let (straight, field) = undistorted(&bent, &camera);
         for y in (5..55).step_by(7) {
             for x in (5..75).step_by(7) {
-                assert!((f64::from(straight.at(x, y)[0]) - 3.0 * x as f64).abs() <= 1.6, "{x} {y}: {:?}", straight.at(x, y));
+                assert!(
+                    (f64::from(straight.at(x, y)[0]) - 3.0 * x as f64).abs() <= 1.6,
+                    "{x} {y}: {:?}",
+                    straight.at(x, y)
+                );
                 assert_eq!(field.at(x, y), 255);
             }
         }

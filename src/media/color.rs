@@ -63,7 +63,11 @@ impl ColorTags {
         if is_rgb(format) {
             return Self::for_lines(frame.height() as usize);
         }
-        let range = if is_full_range_format(format) { color::Range::JPEG } else { frame.color_range() };
+        let range = if is_full_range_format(format) {
+            color::Range::JPEG
+        } else {
+            frame.color_range()
+        };
         Self {
             matrix: frame.color_space(),
             range,
@@ -97,7 +101,11 @@ impl ColorTags {
 
     /// The range that is used; untagged is limited.
     pub(crate) fn yuv_range(&self) -> YuvRange {
-        if self.range == color::Range::JPEG { YuvRange::Full } else { YuvRange::Limited }
+        if self.range == color::Range::JPEG {
+            YuvRange::Full
+        } else {
+            YuvRange::Limited
+        }
     }
 
     /// Matrix and range by the names of libavfilter's `scale`.
@@ -117,11 +125,16 @@ impl ColorTags {
 /// Formats that hold RGB, and need no matrix.
 pub(crate) fn is_rgb(format: Pixel) -> bool {
     let name = format.descriptor().map_or("", |d| d.name());
-    ["rgb", "bgr", "gbr", "argb", "abgr", "0rgb", "0bgr", "pal8", "bgr0", "rgb0"].iter().any(|start| name.starts_with(start))
+    ["rgb", "bgr", "gbr", "argb", "abgr", "0rgb", "0bgr", "pal8", "bgr0", "rgb0"]
+        .iter()
+        .any(|start| name.starts_with(start))
 }
 
 fn is_full_range_format(format: Pixel) -> bool {
-    matches!(format, Pixel::YUVJ420P | Pixel::YUVJ422P | Pixel::YUVJ444P | Pixel::YUVJ440P | Pixel::YUVJ411P | Pixel::GRAY8)
+    matches!(
+        format,
+        Pixel::YUVJ420P | Pixel::YUVJ422P | Pixel::YUVJ444P | Pixel::YUVJ440P | Pixel::YUVJ411P | Pixel::GRAY8
+    )
 }
 
 /// Bits per colour sample of a format.
@@ -161,7 +174,12 @@ pub(crate) fn rgb_from_frame(frame: &frame::Video, tags: &ColorTags, out: &mut I
     match frame.format() {
         Pixel::RGB24 => copy_rows(frame.data(0), frame.stride(0), rgb, rgb_stride as usize),
         Pixel::GRAY8 => {
-            let image = YuvGrayImage { y_plane: frame.data(0), y_stride: stride(frame, 0)?, width, height };
+            let image = YuvGrayImage {
+                y_plane: frame.data(0),
+                y_stride: stride(frame, 0)?,
+                width,
+                height,
+            };
             yuv::yuv400_to_rgb(&image, rgb, rgb_stride, YuvRange::Full, matrix).map_err(text)
         }
         Pixel::NV12 => {
@@ -179,12 +197,21 @@ pub(crate) fn rgb_from_frame(frame: &frame::Video, tags: &ColorTags, out: &mut I
             let planes = [words(frame.data(0))?, words(frame.data(1))?, words(frame.data(2))?];
             let strides = [stride(frame, 0)? / 2, stride(frame, 1)? / 2, stride(frame, 2)? / 2];
             let image = planar(planes, strides, width, height);
-            let convert = if frame.format() == Pixel::YUV420P10LE { yuv::i010_to_rgb } else { yuv::i210_to_rgb };
+            let convert = if frame.format() == Pixel::YUV420P10LE {
+                yuv::i010_to_rgb
+            } else {
+                yuv::i210_to_rgb
+            };
             convert(&image, rgb, rgb_stride, range, matrix).map_err(text)
         }
         format => {
             let planes = [frame.data(0), frame.data(1), frame.data(2)];
-            let image = planar(planes, [stride(frame, 0)?, stride(frame, 1)?, stride(frame, 2)?], width, height);
+            let image = planar(
+                planes,
+                [stride(frame, 0)?, stride(frame, 1)?, stride(frame, 2)?],
+                width,
+                height,
+            );
             let convert = match format {
                 Pixel::YUV420P | Pixel::YUVJ420P => yuv::yuv420_to_rgb,
                 Pixel::YUV422P | Pixel::YUVJ422P => yuv::yuv422_to_rgb,
@@ -199,7 +226,16 @@ pub(crate) fn rgb_from_frame(frame: &frame::Video, tags: &ColorTags, out: &mut I
 fn planar<T: Copy + std::fmt::Debug>(planes: [&[T]; 3], strides: [u32; 3], width: u32, height: u32) -> YuvPlanarImage<'_, T> {
     let [y_plane, u_plane, v_plane] = planes;
     let [y_stride, u_stride, v_stride] = strides;
-    YuvPlanarImage { y_plane, y_stride, u_plane, u_stride, v_plane, v_stride, width, height }
+    YuvPlanarImage {
+        y_plane,
+        y_stride,
+        u_plane,
+        u_stride,
+        v_plane,
+        v_stride,
+        width,
+        height,
+    }
 }
 
 fn text(error: YuvError) -> String {
@@ -238,7 +274,11 @@ impl Planes {
     /// 4:2:0 for even sizes; odd ones keep every chroma sample (4:4:4).
     pub(crate) fn new(width: usize, height: usize, tags: &ColorTags) -> Self {
         let subsampled = width.is_multiple_of(2) && height.is_multiple_of(2);
-        let sampling = if subsampled { yuv::YuvChromaSubsampling::Yuv420 } else { yuv::YuvChromaSubsampling::Yuv444 };
+        let sampling = if subsampled {
+            yuv::YuvChromaSubsampling::Yuv420
+        } else {
+            yuv::YuvChromaSubsampling::Yuv444
+        };
         Self {
             image: YuvPlanarImageMut::alloc(width as u32, height as u32, sampling),
             subsampled,
@@ -253,9 +293,21 @@ impl Planes {
 
     /// Convert a picture of the size given to `new`.
     pub(crate) fn fill(&mut self, picture: &Image<Rgb8>) -> Result<(), String> {
-        let convert = if self.subsampled { yuv::rgb_to_yuv420 } else { yuv::rgb_to_yuv444 };
+        let convert = if self.subsampled {
+            yuv::rgb_to_yuv420
+        } else {
+            yuv::rgb_to_yuv444
+        };
         let row = 3 * picture.width() as u32;
-        convert(&mut self.image, picture.as_bytes(), row, self.range, self.matrix, YuvConversionMode::Balanced).map_err(text)
+        convert(
+            &mut self.image,
+            picture.as_bytes(),
+            row,
+            self.range,
+            self.matrix,
+            YuvConversionMode::Balanced,
+        )
+        .map_err(text)
     }
 
     /// Y, Cb, Cr, each with its row length.

@@ -25,6 +25,9 @@ use crate::time::{Span, Timestamp};
 /// Frame rate assumed where the container says none, frames per second.
 const DEFAULT_RATE: Rational = Rational(25, 1);
 
+/// Errors after which a decoder that is being emptied is given up.
+const MOST_ERRORS_AT_END: u64 = 1000;
+
 /// Prepare libav, once; its own messages are silenced, since every error is reported here.
 pub(crate) fn prepare_libav() {
     static ONCE: Once = Once::new();
@@ -87,7 +90,11 @@ enum Ended {
 
 impl std::fmt::Debug for ContainerReader {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("ContainerReader").field("name", &self.name).field("info", &self.info).finish_non_exhaustive()
+        formatter
+            .debug_struct("ContainerReader")
+            .field("name", &self.name)
+            .field("info", &self.info)
+            .finish_non_exhaustive()
     }
 }
 
@@ -131,8 +138,15 @@ impl ContainerReader {
 
     fn with_input(input: context::Input, name: String, path: Option<PathBuf>) -> Result<Self, MediaError> {
         let Some(stream) = input.streams().best(media::Type::Video) else {
-            let kinds: Vec<_> = input.streams().map(|s| format!("{:?}", s.parameters().medium()).to_lowercase()).collect();
-            let found = if kinds.is_empty() { "nothing".to_owned() } else { kinds.join(", ") };
+            let kinds: Vec<_> = input
+                .streams()
+                .map(|s| format!("{:?}", s.parameters().medium()).to_lowercase())
+                .collect();
+            let found = if kinds.is_empty() {
+                "nothing".to_owned()
+            } else {
+                kinds.join(", ")
+            };
             return Err(MediaError::NoVideoStream { name, found });
         };
         let decoder = open_decoder(&stream, &name)?;
@@ -203,7 +217,11 @@ impl ContainerReader {
         }
         self.pending = true;
         if self.info.rotation_degrees != 0 {
-            tracing::warn!(degrees = self.info.rotation_degrees, "{}: the container asks players to turn the picture; it is left as stored", self.name);
+            tracing::warn!(
+                degrees = self.info.rotation_degrees,
+                "{}: the container asks players to turn the picture; it is left as stored",
+                self.name
+            );
         }
         Ok(())
     }
@@ -225,19 +243,35 @@ impl ContainerReader {
             }
             let mut image = pool.take(self.info.width, self.info.height);
             self.convert_current(&mut image).map_err(|reason| self.decode_error(reason))?;
-            return Ok(Some(DecodedFrame { image, timestamp, number }));
+            return Ok(Some(DecodedFrame {
+                image,
+                timestamp,
+                number,
+            }));
         }
     }
 
     /// Time stamp of the current frame: its own, or one frame after the last where it has none or runs backwards.
     fn stamp_current(&mut self) -> Timestamp {
-        let unit = self.deinterlacer.as_mut().and_then(Filter::time_base).unwrap_or(self.time_base);
-        let own = self.current.pts().or(self.current.timestamp()).map(|ticks| timestamp_from_ticks(ticks, unit));
+        let unit = self
+            .deinterlacer
+            .as_mut()
+            .and_then(Filter::time_base)
+            .unwrap_or(self.time_base);
+        let own = self
+            .current
+            .pts()
+            .or(self.current.timestamp())
+            .map(|ticks| timestamp_from_ticks(ticks, unit));
         let (frames, seconds) = self.info.average_frame_rate;
         let step = Span::from_seconds(f64::from(seconds) / f64::from(frames));
         let stamp = match (own, self.last) {
             (Some(own), Some(last)) if own <= last => {
-                tracing::debug!("{}: frame {} is stamped no later than the one before it", self.name, self.number);
+                tracing::debug!(
+                    "{}: frame {} is stamped no later than the one before it",
+                    self.name,
+                    self.number
+                );
                 last + step
             }
             (Some(own), _) => own,
@@ -258,7 +292,11 @@ impl ContainerReader {
     }
 
     fn decode_error(&self, reason: impl ToString) -> MediaError {
-        MediaError::Decode { name: self.name.clone(), frame: self.number, reason: reason.to_string() }
+        MediaError::Decode {
+            name: self.name.clone(),
+            frame: self.number,
+            reason: reason.to_string(),
+        }
     }
 
     /// Bring the next decoded (and deinterlaced) frame to `current`; false at the end.
@@ -295,7 +333,13 @@ impl ContainerReader {
                         filter.flush().map_err(|e| self.decode_error(e))?;
                     }
                 }
-                Err(error) => self.note_damage(error),
+                Err(error) => {
+                    self.note_damage(error);
+                    // Behind the last packet an error may repeat for ever.
+                    if self.ended == Ended::PacketsDone && self.damaged_packets > MOST_ERRORS_AT_END {
+                        self.ended = Ended::DecoderDone;
+                    }
+                }
             }
         }
     }
@@ -303,7 +347,10 @@ impl ContainerReader {
     fn note_damage(&mut self, error: Error) {
         if self.damaged_packets == 0 {
             let seconds = self.last.unwrap_or_default().seconds();
-            tracing::warn!("{}: damaged data after {seconds:.3} s ({error}); decoding goes on behind it", self.name);
+            tracing::warn!(
+                "{}: damaged data after {seconds:.3} s ({error}); decoding goes on behind it",
+                self.name
+            );
         }
         self.damaged_packets += 1;
     }
@@ -348,9 +395,19 @@ impl ContainerReader {
             return Ok(());
         }
         self.ended = Ended::Reported;
-        let stamp = self.decoded.pts().or(self.decoded.timestamp()).map(|ticks| timestamp_from_ticks(ticks, self.time_base));
+        let stamp = self
+            .decoded
+            .pts()
+            .or(self.decoded.timestamp())
+            .map(|ticks| timestamp_from_ticks(ticks, self.time_base));
         let seconds = stamp.or(self.last).unwrap_or_default().seconds();
-        Err(MediaError::SizeChanged { name: self.name.clone(), expected, found, frame: self.number, seconds })
+        Err(MediaError::SizeChanged {
+            name: self.name.clone(),
+            expected,
+            found,
+            frame: self.number,
+            seconds,
+        })
     }
 
     /// At the end: was it the end of the video, or only of the file?
@@ -369,7 +426,12 @@ impl ContainerReader {
             (_, None) => return Ok(false),
         };
         let seconds = self.last.unwrap_or_default().seconds();
-        Err(MediaError::Truncated { name: self.name.clone(), found, frames: self.read, seconds })
+        Err(MediaError::Truncated {
+            name: self.name.clone(),
+            found,
+            frames: self.read,
+            seconds,
+        })
     }
 
     /// The current frame as RGB: directly where the format is a common one, else by libswscale.
@@ -381,7 +443,11 @@ impl ContainerReader {
         }
         let describe = |error: Error| error.to_string();
         if self.scaler.is_none() {
-            let input = if color::is_rgb(self.current.format()) { String::new() } else { format!("{}:", tags.scale_options(self.info.height)) };
+            let input = if color::is_rgb(self.current.format()) {
+                String::new()
+            } else {
+                format!("{}:", tags.scale_options(self.info.height))
+            };
             let chain = format!("scale={input}flags=bicubic+accurate_rnd+full_chroma_int,format=rgb24");
             self.scaler = Some(Filter::new(&self.current, self.time_base, &chain).map_err(describe)?);
         }
@@ -404,7 +470,12 @@ impl ContainerReader {
         let target = (start - Span::from_seconds(0.5)).0.max(0) / 1000;
         let reopened = Self::open(&path)?;
         let (info, name) = (self.info.clone(), self.name.clone());
-        *self = Self { info, name, drop_before: Some(start), ..reopened };
+        *self = Self {
+            info,
+            name,
+            drop_before: Some(start),
+            ..reopened
+        };
         let first = stamps.first().copied().unwrap_or_default();
         if stamps.len() < 2 || Timestamp(target * 1000) <= first || self.input.seek(target, ..target + 1).is_err() {
             return Ok(());
@@ -424,7 +495,12 @@ impl ContainerReader {
         }
         let reopened = Self::open(&path)?;
         let (info, name) = (self.info.clone(), self.name.clone());
-        *self = Self { info, name, drop_before: Some(start), ..reopened };
+        *self = Self {
+            info,
+            name,
+            drop_before: Some(start),
+            ..reopened
+        };
         Ok(())
     }
 }
@@ -449,7 +525,10 @@ fn packet_stamps(path: &Path, stream: usize) -> Result<Vec<Timestamp>, MediaErro
 
 fn open_decoder(stream: &ffmpeg_next::Stream<'_>, name: &str) -> Result<decoder::Video, MediaError> {
     let codec = format!("{:?}", stream.parameters().id()).to_lowercase();
-    let refuse = |_| MediaError::NoDecoder { name: name.to_owned(), codec: codec.clone() };
+    let refuse = |_| MediaError::NoDecoder {
+        name: name.to_owned(),
+        codec: codec.clone(),
+    };
     let mut context = codec::context::Context::from_parameters(stream.parameters()).map_err(refuse)?;
     context.set_threading(threading::Config::kind(threading::Type::Frame));
     let mut decoder = context.decoder();
@@ -458,13 +537,24 @@ fn open_decoder(stream: &ffmpeg_next::Stream<'_>, name: &str) -> Result<decoder:
 }
 
 fn rotation_of(stream: &ffmpeg_next::Stream<'_>) -> i32 {
-    let Some(matrix) = stream.side_data().find(|data| data.kind() == side_data::Type::DisplayMatrix) else { return 0 };
-    let word = |index: usize| matrix.data().get(4 * index..4 * index + 4).map_or(0, |bytes| i32::from_ne_bytes(bytes.try_into().unwrap_or_default()));
+    let Some(matrix) = stream.side_data().find(|data| data.kind() == side_data::Type::DisplayMatrix) else {
+        return 0;
+    };
+    let word = |index: usize| {
+        matrix
+            .data()
+            .get(4 * index..4 * index + 4)
+            .map_or(0, |bytes| i32::from_ne_bytes(bytes.try_into().unwrap_or_default()))
+    };
     // The matrix turns counter-clockwise in 16.16 fixed point; its first row is (a, b).
     let degrees = f64::from(word(1)).atan2(f64::from(word(0))).to_degrees().round() as i32;
     degrees.rem_euclid(360)
 }
 
 fn not_a_video(path: &Path, found: &str, advice: &str) -> MediaError {
-    MediaError::NotAVideo { name: path.display().to_string(), found: found.to_owned(), advice: advice.to_owned() }
+    MediaError::NotAVideo {
+        name: path.display().to_string(),
+        found: found.to_owned(),
+        advice: advice.to_owned(),
+    }
 }

@@ -40,7 +40,11 @@ pub(crate) struct ContainerWriter {
 
 impl std::fmt::Debug for ContainerWriter {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("ContainerWriter").field("path", &self.path).field("frames", &self.frames).finish_non_exhaustive()
+        formatter
+            .debug_struct("ContainerWriter")
+            .field("path", &self.path)
+            .field("frames", &self.frames)
+            .finish_non_exhaustive()
     }
 }
 
@@ -51,18 +55,28 @@ impl ContainerWriter {
             Some(sound) => SoundCopy::open(sound)?,
             None => None,
         };
-        let Some(sound) = sound else { return Self::open(path, settings, None).map_err(|e| cannot_create(path, e)) };
+        let Some(sound) = sound else {
+            return Self::open(path, settings, None).map_err(|e| cannot_create(path, e));
+        };
         let codec = sound.stream().map_or(codec::Id::None, |s| s.parameters().id());
         Self::open(path, settings, Some(sound)).or_else(|error| {
             let silent = Self::open(path, settings, None).map_err(|_| cannot_create(path, error))?;
-            tracing::warn!("{}: this kind of file cannot hold {codec:?} sound; written without sound, .mkv can hold it", path.display());
+            tracing::warn!(
+                "{}: this kind of file cannot hold {codec:?} sound; written without sound, .mkv can hold it",
+                path.display()
+            );
             Ok(silent)
         })
     }
 
     fn open(path: &Path, settings: &WriterSettings, sound: Option<SoundCopy>) -> Result<Self, Error> {
-        let name = libav_path(path).map_err(|_| Error::Other { errno: ffmpeg_next::error::EINVAL })?;
-        let container = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+        let name = libav_path(path).map_err(|_| Error::Other {
+            errno: ffmpeg_next::error::EINVAL,
+        })?;
+        let container = path
+            .extension()
+            .map(|e| e.to_string_lossy().to_ascii_lowercase())
+            .unwrap_or_default();
         let mut output = format::output(&name)?;
         let global_header = output.format().flags().contains(flag::Flags::GLOBAL_HEADER);
         let time_base = time_base_for(&container, settings);
@@ -84,7 +98,9 @@ impl ContainerWriter {
         let mut metadata = Dictionary::new();
         for (key, value) in &settings.metadata {
             // What describes the old container is not true of the new one.
-            if !["major_brand", "minor_version", "compatible_brands", "encoder", "duration"].contains(&key.to_ascii_lowercase().as_str()) {
+            if !["major_brand", "minor_version", "compatible_brands", "encoder", "duration"]
+                .contains(&key.to_ascii_lowercase().as_str())
+            {
                 metadata.set(key, value);
             }
         }
@@ -108,7 +124,9 @@ impl ContainerWriter {
             sound,
             planes,
             format: choice.format,
-            frame_ticks: (ticks_per_second * f64::from(seconds) / f64::from(frames.max(1))).round().max(1.0) as i64,
+            frame_ticks: (ticks_per_second * f64::from(seconds) / f64::from(frames.max(1)))
+                .round()
+                .max(1.0) as i64,
             origin: settings.origin,
             last_ticks: None,
             frames: 0,
@@ -120,7 +138,11 @@ impl ContainerWriter {
         let mut frame = frame::Video::new(self.format, picture.width() as u32, picture.height() as u32);
         let planes = self.planes.as_mut().ok_or_else(|| cannot_create(&self.path, Error::Bug))?;
         let frames = self.frames;
-        planes.fill(picture).map_err(|reason| MediaError::Write { path: self.path.clone(), frames, reason })?;
+        planes.fill(picture).map_err(|reason| MediaError::Write {
+            path: self.path.clone(),
+            frames,
+            reason,
+        })?;
         for (index, (plane, row)) in planes.planes().into_iter().enumerate() {
             copy_plane(plane, row, &mut frame, index);
         }
@@ -143,7 +165,9 @@ impl ContainerWriter {
         frame.set_pts(Some(ticks));
         frame.set_kind(ffmpeg_next::picture::Type::None);
         let sound = self.write_sound(Some(timestamp));
-        let sent = sound.and_then(|()| self.encoder.send_frame(&frame)).and_then(|()| self.drain());
+        let sent = sound
+            .and_then(|()| self.encoder.send_frame(&frame))
+            .and_then(|()| self.drain());
         sent.map_err(|error| self.fail(error))?;
         self.frames += 1;
         Ok(())
@@ -151,7 +175,11 @@ impl ContainerWriter {
 
     fn fail(&mut self, error: Error) -> MediaError {
         self.failed = true;
-        MediaError::Write { path: self.path.clone(), frames: self.frames, reason: error.to_string() }
+        MediaError::Write {
+            path: self.path.clone(),
+            frames: self.frames,
+            reason: error.to_string(),
+        }
     }
 
     fn drain(&mut self) -> Result<(), Error> {
@@ -171,7 +199,9 @@ impl ContainerWriter {
     }
 
     fn write_sound(&mut self, until: Option<Timestamp>) -> Result<(), Error> {
-        let Some((sound, time_base)) = &mut self.sound else { return Ok(()) };
+        let Some((sound, time_base)) = &mut self.sound else {
+            return Ok(());
+        };
         while let Some(mut packet) = sound.take_before(until, self.origin) {
             packet.set_stream(1);
             packet.rescale_ts(sound.time_base(), *time_base);
@@ -185,7 +215,11 @@ impl ContainerWriter {
             // Reported when it happened; the fragments on disk stand as they are.
             return Ok(());
         }
-        let flushed = self.encoder.send_eof().and_then(|()| self.drain()).and_then(|()| self.write_sound(None));
+        let flushed = self
+            .encoder
+            .send_eof()
+            .and_then(|()| self.drain())
+            .and_then(|()| self.write_sound(None));
         let ended = flushed.and_then(|()| self.output.write_trailer());
         ended.map_err(|error| self.fail(error))
     }
@@ -201,12 +235,26 @@ struct CodecChoice {
 impl CodecChoice {
     fn of(settings: &WriterSettings, container: &str) -> Self {
         match settings.content {
-            Content::Mask if container == "mp4" || container == "mov" => Self { name: "libx264", format: Pixel::GRAY8, lossless: true },
-            Content::Mask => Self { name: "ffv1", format: Pixel::GRAY8, lossless: true },
-            Content::Color if settings.width.is_multiple_of(2) && settings.height.is_multiple_of(2) => {
-                Self { name: "libx264", format: Pixel::YUV420P, lossless: false }
-            }
-            Content::Color => Self { name: "libx264", format: Pixel::YUV444P, lossless: false },
+            Content::Mask if container == "mp4" || container == "mov" => Self {
+                name: "libx264",
+                format: Pixel::GRAY8,
+                lossless: true,
+            },
+            Content::Mask => Self {
+                name: "ffv1",
+                format: Pixel::GRAY8,
+                lossless: true,
+            },
+            Content::Color if settings.width.is_multiple_of(2) && settings.height.is_multiple_of(2) => Self {
+                name: "libx264",
+                format: Pixel::YUV420P,
+                lossless: false,
+            },
+            Content::Color => Self {
+                name: "libx264",
+                format: Pixel::YUV444P,
+                lossless: false,
+            },
         }
     }
 }
@@ -286,7 +334,10 @@ fn muxer_options(container: &str) -> Dictionary<'static> {
 
 /// A codec's four-letter tag belongs to the container it came from; 0 lets the muxer choose its own.
 fn forget_codec_tag(stream: &mut ffmpeg_next::StreamMut<'_>) {
-    #[expect(unsafe_code, reason = "ffmpeg-next has no safe setter for the codec tag, and stream copy needs one")]
+    #[expect(
+        unsafe_code,
+        reason = "ffmpeg-next has no safe setter for the codec tag, and stream copy needs one"
+    )]
     // SAFETY: `stream` borrows a live output context whose stream owns its `codecpar`; a plain integer field is written.
     unsafe {
         (*stream.parameters().as_mut_ptr()).codec_tag = 0;
@@ -303,5 +354,8 @@ fn copy_plane(from: &[u8], row: usize, frame: &mut frame::Video, plane: usize) {
 }
 
 fn cannot_create(path: &Path, error: Error) -> MediaError {
-    MediaError::Create { path: path.into(), reason: error.to_string() }
+    MediaError::Create {
+        path: path.into(),
+        reason: error.to_string(),
+    }
 }

@@ -36,7 +36,9 @@ pub enum MediaError {
         found: String,
     },
     /// No decoder in this libav.
-    #[error("{name}: no decoder for {codec} in the installed libav; convert it with `ffmpeg -i INPUT -c:v libx264 -crf 12 OUTPUT.mp4`")]
+    #[error(
+        "{name}: no decoder for {codec} in the installed libav; convert it with `ffmpeg -i INPUT -c:v libx264 -crf 12 OUTPUT.mp4`"
+    )]
     NoDecoder {
         /// The file or stream.
         name: String,
@@ -161,6 +163,9 @@ pub enum MediaError {
 pub(crate) fn libav_path(path: &Path) -> Result<String, MediaError> {
     match path.to_str() {
         Some(text) if !text.contains('\0') => Ok(format!("file:{text}")),
-        _ => Err(MediaError::Create { path: path.into(), reason: "the name is not valid UTF-8".into() }),
+        _ => Err(MediaError::Create {
+            path: path.into(),
+            reason: "the name is not valid UTF-8".into(),
+        }),
     }
 }

@@ -53,7 +53,12 @@ impl Filter {
     pub(crate) fn pull(&mut self, out: &mut frame::Video) -> Result<bool, Error> {
         match self.graph.get("out").ok_or(Error::FilterNotFound)?.sink().frame(out) {
             Ok(()) => Ok(true),
-            Err(Error::Eof | Error::Other { errno: ffmpeg_next::error::EAGAIN }) => Ok(false),
+            Err(
+                Error::Eof
+                | Error::Other {
+                    errno: ffmpeg_next::error::EAGAIN,
+                },
+            ) => Ok(false),
             Err(error) => Err(error),
         }
     }

@@ -36,20 +36,35 @@ impl NumberedName {
         let (digits, suffix) = rest.split_once('d')?;
         let digits = if digits.is_empty() { 0 } else { digits.parse().ok()? };
         let folder = path.parent().map_or_else(PathBuf::new, Path::to_path_buf);
-        Some(Self { folder, prefix: prefix.to_owned(), digits, suffix: suffix.to_owned() })
+        Some(Self {
+            folder,
+            prefix: prefix.to_owned(),
+            digits,
+            suffix: suffix.to_owned(),
+        })
     }
 
     /// The plain `FOLDER/%06d.png`.
     pub(crate) fn in_folder(folder: &Path) -> Self {
-        Self { folder: folder.into(), prefix: String::new(), digits: 6, suffix: ".png".to_owned() }
+        Self {
+            folder: folder.into(),
+            prefix: String::new(),
+            digits: 6,
+            suffix: ".png".to_owned(),
+        }
     }
 
     pub(crate) fn folder(&self) -> &Path {
-        if self.folder.as_os_str().is_empty() { Path::new(".") } else { &self.folder }
+        if self.folder.as_os_str().is_empty() {
+            Path::new(".")
+        } else {
+            &self.folder
+        }
     }
 
     pub(crate) fn path(&self, number: u64) -> PathBuf {
-        self.folder.join(format!("{}{number:0width$}{}", self.prefix, self.suffix, width = self.digits))
+        self.folder
+            .join(format!("{}{number:0width$}{}", self.prefix, self.suffix, width = self.digits))
     }
 
     fn number_in(&self, name: &str) -> Option<u64> {
@@ -74,7 +89,9 @@ fn list(path: &Path) -> Result<Vec<PathBuf>, MediaError> {
     let mut found = Vec::new();
     for entry in entries.flatten() {
         let name = entry.file_name().to_string_lossy().into_owned();
-        let known = name.rsplit_once('.').is_some_and(|(_, ending)| ENDINGS.contains(&ending.to_ascii_lowercase().as_str()));
+        let known = name
+            .rsplit_once('.')
+            .is_some_and(|(_, ending)| ENDINGS.contains(&ending.to_ascii_lowercase().as_str()));
         let number = match &pattern {
             Some(pattern) => pattern.number_in(&name),
             None if known => last_number(&name),
@@ -92,7 +109,10 @@ fn list(path: &Path) -> Result<Vec<PathBuf>, MediaError> {
 }
 
 fn decode(path: &Path) -> Result<image::RgbImage, MediaError> {
-    let refuse = |reason: String| MediaError::Image { path: path.into(), reason };
+    let refuse = |reason: String| MediaError::Image {
+        path: path.into(),
+        reason,
+    };
     let decoder = Decoder::open(path).map_err(|e| refuse(e.to_string()))?;
     let decoder = decoder.with_guessed_format().map_err(|e| refuse(e.to_string()))?;
     Ok(decoder.decode().map_err(|e| refuse(e.to_string()))?.into_rgb8())
@@ -140,11 +160,15 @@ impl ImageReader {
     }
 
     pub(crate) fn seek(&mut self, start: Timestamp) {
-        self.next = (0..self.files.len()).find(|&i| Self::stamp(i) >= start).unwrap_or(self.files.len());
+        self.next = (0..self.files.len())
+            .find(|&i| Self::stamp(i) >= start)
+            .unwrap_or(self.files.len());
     }
 
     pub(crate) fn next_frame(&mut self, pool: &Pool<Rgb8>) -> Result<Option<DecodedFrame>, MediaError> {
-        let Some(path) = self.files.get(self.next) else { return Ok(None) };
+        let Some(path) = self.files.get(self.next) else {
+            return Ok(None);
+        };
         let index = self.next;
         let picture = decode(path).inspect_err(|_| self.next = self.files.len())?;
         let found = (picture.width() as usize, picture.height() as usize);
@@ -153,12 +177,22 @@ impl ImageReader {
         if found != expected {
             let name = path.display().to_string();
             self.next = self.files.len();
-            return Err(MediaError::SizeChanged { name, expected, found, frame: index as u64, seconds: timestamp.seconds() });
+            return Err(MediaError::SizeChanged {
+                name,
+                expected,
+                found,
+                frame: index as u64,
+                seconds: timestamp.seconds(),
+            });
         }
         self.next += 1;
         let mut image = pool.take(expected.0, expected.1);
         image.as_bytes_mut().copy_from_slice(picture.as_raw());
-        Ok(Some(DecodedFrame { image, timestamp, number: index as u64 }))
+        Ok(Some(DecodedFrame {
+            image,
+            timestamp,
+            number: index as u64,
+        }))
     }
 }
 
@@ -166,7 +200,9 @@ impl ImageReader {
 fn write_png(path: &Path, bytes: &[u8], size: (usize, usize), kind: ExtendedColorType) -> Result<(), String> {
     let file = File::create(path).map_err(|e| e.to_string())?;
     let encoder = PngEncoder::new_with_quality(BufWriter::new(file), CompressionType::Fast, FilterType::Adaptive);
-    encoder.write_image(bytes, size.0 as u32, size.1 as u32, kind).map_err(|e| e.to_string())
+    encoder
+        .write_image(bytes, size.0 as u32, size.1 as u32, kind)
+        .map_err(|e| e.to_string())
 }
 
 /// Writes numbered PNGs.
@@ -180,9 +216,17 @@ pub(crate) struct ImageWriter {
 impl ImageWriter {
     pub(crate) fn create(name: NumberedName, size: (usize, usize), force: bool) -> Result<Self, MediaError> {
         let folder = name.folder();
-        std::fs::create_dir_all(folder).map_err(|e| MediaError::Create { path: folder.into(), reason: e.to_string() })?;
-        let entries = std::fs::read_dir(folder).map_err(|e| MediaError::Create { path: folder.into(), reason: e.to_string() })?;
-        let there = entries.flatten().find(|entry| name.number_in(&entry.file_name().to_string_lossy()).is_some());
+        std::fs::create_dir_all(folder).map_err(|e| MediaError::Create {
+            path: folder.into(),
+            reason: e.to_string(),
+        })?;
+        let entries = std::fs::read_dir(folder).map_err(|e| MediaError::Create {
+            path: folder.into(),
+            reason: e.to_string(),
+        })?;
+        let there = entries
+            .flatten()
+            .find(|entry| name.number_in(&entry.file_name().to_string_lossy()).is_some());
         match there {
             Some(entry) if !force => Err(MediaError::Exists { path: entry.path() }),
             _ => Ok(Self { name, size, written: 0 }),
@@ -191,11 +235,19 @@ impl ImageWriter {
 
     pub(crate) fn write(&mut self, bytes: &[u8], gray: bool) -> Result<(), MediaError> {
         let path = self.name.path(self.written);
-        let kind = if gray { ExtendedColorType::L8 } else { ExtendedColorType::Rgb8 };
+        let kind = if gray {
+            ExtendedColorType::L8
+        } else {
+            ExtendedColorType::Rgb8
+        };
         write_png(&path, bytes, self.size, kind).map_err(|reason| {
             // Half a picture is of no use to anybody.
             let _gone = std::fs::remove_file(&path);
-            MediaError::Write { path: path.clone(), frames: self.written, reason }
+            MediaError::Write {
+                path: path.clone(),
+                frames: self.written,
+                reason,
+            }
         })?;
         self.written += 1;
         Ok(())

@@ -110,7 +110,9 @@ impl VideoReader {
 
     /// Read y4m (or anything that libav recognises without going back) from a stream called `name`.
     pub fn from_stream(stream: impl std::io::Read + Send + 'static, name: &str) -> Result<Self, MediaError> {
-        Ok(Self { kind: Kind::Container(Box::new(ContainerReader::from_stream(stream, name)?)) })
+        Ok(Self {
+            kind: Kind::Container(Box::new(ContainerReader::from_stream(stream, name)?)),
+        })
     }
 
     /// What is known of the video.

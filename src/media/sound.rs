@@ -5,10 +5,10 @@ use std::path::Path;
 use ffmpeg_next::format::context;
 use ffmpeg_next::{Packet, Rational, format, media};
 
-use crate::media::container_reader::{prepare_libav, timestamp_from_ticks, ticks_from_timestamp};
+use crate::media::container_reader::{prepare_libav, ticks_from_timestamp, timestamp_from_ticks};
 use crate::media::error::{MediaError, libav_path};
 use crate::media::writer::Sound;
-use crate::time::{Span, Timestamp};
+use crate::time::Timestamp;
 
 /// Reads the sound of one file in step with the pictures of another.
 pub(crate) struct SoundCopy {
@@ -25,9 +25,18 @@ impl SoundCopy {
     pub(crate) fn open(sound: &Sound) -> Result<Option<Self>, MediaError> {
         prepare_libav();
         let input = format::input(&libav_path(&sound.path)?).map_err(|error| not_readable(&sound.path, &error.to_string()))?;
-        let Some(stream) = input.streams().best(media::Type::Audio) else { return Ok(None) };
+        let Some(stream) = input.streams().best(media::Type::Audio) else {
+            return Ok(None);
+        };
         let (index, time_base) = (stream.index(), stream.time_base());
-        let mut copy = Self { input, stream: index, time_base, start: sound.start, end: sound.end, next: None };
+        let mut copy = Self {
+            input,
+            stream: index,
+            time_base,
+            start: sound.start,
+            end: sound.end,
+            next: None,
+        };
         if let Some(start) = sound.start {
             let target = start.0 / 1000;
             // Not every container can: then what comes before the start is read and dropped.
@@ -66,14 +75,15 @@ impl SoundCopy {
         let mut packet = Packet::empty();
         // Unreadable sound ends here; the pictures tell of a truncated file.
         while packet.read(&mut self.input).is_ok() {
-            let Some(ticks) = packet.pts().or(packet.dts()) else { continue };
+            let Some(ticks) = packet.pts().or(packet.dts()) else {
+                continue;
+            };
             if packet.stream() != self.stream {
                 continue;
             }
             let time = timestamp_from_ticks(ticks, self.time_base);
-            let over = time + Span(timestamp_from_ticks(packet.duration(), self.time_base).0);
             // An encoder's run-in is stamped before 0; players drop it, and some containers cannot hold it.
-            if time < Timestamp(0) || self.start.is_some_and(|start| over <= start || time < start) {
+            if time < Timestamp(0) || self.start.is_some_and(|start| time < start) {
                 continue;
             }
             if self.end.is_some_and(|end| time >= end) {
@@ -88,5 +98,9 @@ impl SoundCopy {
 
 fn not_readable(path: &Path, found: &str) -> MediaError {
     let advice = "check that the file plays".to_owned();
-    MediaError::NotAVideo { name: path.display().to_string(), found: found.to_owned(), advice }
+    MediaError::NotAVideo {
+        name: path.display().to_string(),
+        found: found.to_owned(),
+        advice,
+    }
 }

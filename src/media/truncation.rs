@@ -66,7 +66,9 @@ fn riff(file: &mut File, length: u64) -> Option<Shortfall> {
         file.seek(SeekFrom::Start(at)).ok()?;
         let mut head = [0; 8];
         file.read_exact(&mut head).ok()?;
-        let [b'R', b'I', b'F', b'F', size @ ..] = head else { return None };
+        let [b'R', b'I', b'F', b'F', size @ ..] = head else {
+            return None;
+        };
         let size = u64::from(u32::from_le_bytes(size));
         // A recorder that was killed leaves the length at 0 or at its largest value: no promise.
         if size == 0 || size >= u64::from(u32::MAX) - 8 {

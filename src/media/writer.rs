@@ -32,11 +32,20 @@ impl Output {
         if text.ends_with('/') || NumberedName::parse(argument).is_some() {
             return Ok(Self::Images(argument.into()));
         }
-        let ending = argument.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+        let ending = argument
+            .extension()
+            .map(|e| e.to_string_lossy().to_ascii_lowercase())
+            .unwrap_or_default();
         match ending.as_str() {
             "mp4" | "mkv" | "avi" | "mov" => Ok(Self::File(argument.into())),
-            "" => Err(MediaError::UnknownOutput { path: argument.into(), found: "no ending".to_owned() }),
-            other => Err(MediaError::UnknownOutput { path: argument.into(), found: format!(".{other}") }),
+            "" => Err(MediaError::UnknownOutput {
+                path: argument.into(),
+                found: "no ending".to_owned(),
+            }),
+            other => Err(MediaError::UnknownOutput {
+                path: argument.into(),
+                found: format!(".{other}"),
+            }),
         }
     }
 }
@@ -126,7 +135,11 @@ impl WriterSettings {
     /// The same video's masks: lossless gray, without sound.
     #[must_use]
     pub fn for_masks(&self) -> Self {
-        Self { content: Content::Mask, sound: None, ..self.clone() }
+        Self {
+            content: Content::Mask,
+            sound: None,
+            ..self.clone()
+        }
     }
 }
 
@@ -154,21 +167,43 @@ impl VideoWriter {
         let (kind, path) = match output {
             Output::File(path) => {
                 refuse_overwriting(path, settings, force)?;
-                (Kind::Container(Box::new(ContainerWriter::create(path, settings)?)), path.clone())
+                (
+                    Kind::Container(Box::new(ContainerWriter::create(path, settings)?)),
+                    path.clone(),
+                )
             }
             Output::Images(path) => {
                 let name = NumberedName::parse(path).unwrap_or_else(|| NumberedName::in_folder(path));
                 (Kind::Images(ImageWriter::create(name, size, force)?), path.clone())
             }
-            Output::Y4mStdout => (Kind::Y4m(Y4mWriter::new(std::io::stdout(), "stdout", settings)?), PathBuf::from("-")),
+            Output::Y4mStdout => (
+                Kind::Y4m(Y4mWriter::new(std::io::stdout(), "stdout", settings)?),
+                PathBuf::from("-"),
+            ),
         };
-        Ok(Self { kind, path, size, content: settings.content, finished: false })
+        Ok(Self {
+            kind,
+            path,
+            size,
+            content: settings.content,
+            finished: false,
+        })
     }
 
     /// Write y4m to a stream called `name`.
-    pub fn to_stream(stream: impl std::io::Write + Send + 'static, name: &str, settings: &WriterSettings) -> Result<Self, MediaError> {
+    pub fn to_stream(
+        stream: impl std::io::Write + Send + 'static,
+        name: &str,
+        settings: &WriterSettings,
+    ) -> Result<Self, MediaError> {
         let kind = Kind::Y4m(Y4mWriter::new(stream, name, settings)?);
-        Ok(Self { kind, path: name.into(), size: (settings.width, settings.height), content: settings.content, finished: false })
+        Ok(Self {
+            kind,
+            path: name.into(),
+            size: (settings.width, settings.height),
+            content: settings.content,
+            finished: false,
+        })
     }
 
     /// Where it is written to.
@@ -199,10 +234,17 @@ impl VideoWriter {
     fn check(&self, found: (usize, usize), content: Content) -> Result<(), MediaError> {
         if content != self.content {
             let expected = if self.content == Content::Color { "colour" } else { "mask" };
-            return Err(MediaError::WrongKind { path: self.path.clone(), expected });
+            return Err(MediaError::WrongKind {
+                path: self.path.clone(),
+                expected,
+            });
         }
         if found != self.size {
-            return Err(MediaError::WrongSize { path: self.path.clone(), expected: self.size, found });
+            return Err(MediaError::WrongSize {
+                path: self.path.clone(),
+                expected: self.size,
+                found,
+            });
         }
         Ok(())
     }

@@ -20,7 +20,11 @@ pub(crate) struct Y4mWriter {
 
 impl std::fmt::Debug for Y4mWriter {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("Y4mWriter").field("name", &self.name).field("frames", &self.frames).finish_non_exhaustive()
+        formatter
+            .debug_struct("Y4mWriter")
+            .field("name", &self.name)
+            .field("frames", &self.frames)
+            .finish_non_exhaustive()
     }
 }
 
@@ -40,18 +44,34 @@ impl Y4mWriter {
             "YUV4MPEG2 W{} H{} F{frames}:{seconds} Ip A{across}:{down} {sampling} XCOLORRANGE={range}\n",
             settings.width, settings.height
         );
-        let mut writer = Self { stream: BufWriter::new(Box::new(stream)), name: name.to_owned(), planes, frames: 0 };
-        writer.stream.write_all(header.as_bytes()).map_err(|error| writer.failed(&error))?;
+        let mut writer = Self {
+            stream: BufWriter::new(Box::new(stream)),
+            name: name.to_owned(),
+            planes,
+            frames: 0,
+        };
+        writer
+            .stream
+            .write_all(header.as_bytes())
+            .map_err(|error| writer.failed(&error))?;
         Ok(writer)
     }
 
     fn failed(&self, error: &std::io::Error) -> MediaError {
-        MediaError::Write { path: self.name.as_str().into(), frames: self.frames, reason: error.to_string() }
+        MediaError::Write {
+            path: self.name.as_str().into(),
+            frames: self.frames,
+            reason: error.to_string(),
+        }
     }
 
     pub(crate) fn write_color(&mut self, picture: &Image<Rgb8>) -> Result<(), MediaError> {
         let frames = self.frames;
-        self.planes.fill(picture).map_err(|reason| MediaError::Write { path: self.name.as_str().into(), frames, reason })?;
+        self.planes.fill(picture).map_err(|reason| MediaError::Write {
+            path: self.name.as_str().into(),
+            frames,
+            reason,
+        })?;
         let [y, u, v] = self.planes.planes();
         let written = write_frame(&mut self.stream, &[y.0, u.0, v.0]);
         self.count(written)

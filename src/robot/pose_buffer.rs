@@ -194,7 +194,6 @@ impl PoseBuffer {
         if !near(&self.samples[from]) {
             from += 1;
         }
-        let window = || (from..=to).map(|i| &self.samples[i]);
         if to < from || to - from + 1 < FEWEST_SAMPLES {
             return None;
         }
@@ -207,24 +206,27 @@ impl PoseBuffer {
             let turned = (sample.base_from_hand.rotation() * reference.inverse()).scaled_axis();
             (sample.base_from_hand.translation(), turned)
         };
-        let mut fits = (LocalFit::default(), LocalFit::default());
-        // Second and third pass: Cleveland 1979, bisquare weights from the residuals of the pass before.
-        for pass in 0..3 {
-            let scales = if pass == 0 { None } else { Some(residual_scales(window().map(|s| residuals(s, instant, half_ms, &fits, deviations(s))))) };
+        let mut fits = None;
+        // Weights from the residuals of the pass before (Cleveland 1979). The first pass has none, and in so short a window an
+        // outlier would bend the fit to itself: there, a sample is held against the line between its two neighbours.
+        for _ in 0..3 {
+            let misfit = |i: usize| match &fits {
+                Some(fits) => residuals(&self.samples[i], instant, half_ms, fits, deviations(&self.samples[i])),
+                None => self.misfit_among_neighbours(i, from, to),
+            };
+            let scales = residual_scales((from..=to).map(misfit));
             let mut sums = (Sums::default(), Sums::default());
-            for sample in window() {
-                let u = (sample.stamp - instant).milliseconds() / half_ms;
+            for i in from..=to {
+                let u = (self.samples[i].stamp - instant).milliseconds() / half_ms;
                 let tricube = (1.0 - u.abs().powi(3)).powi(3);
-                let (moved, turned) = deviations(sample);
-                let robust = scales.map_or((1.0, 1.0), |(move_scale, turn_scale)| {
-                    let (a, b) = residuals(sample, instant, half_ms, &fits, (moved, turned));
-                    (bisquare(a, move_scale), bisquare(b, turn_scale))
-                });
-                sums.0.add(u, tricube * robust.0, &moved);
-                sums.1.add(u, tricube * robust.1, &turned);
+                let (moved, turned) = deviations(&self.samples[i]);
+                let (a, b) = misfit(i);
+                sums.0.add(u, tricube * bisquare(a, scales.0), &moved);
+                sums.1.add(u, tricube * bisquare(b, scales.1), &turned);
             }
-            fits = (sums.0.solve(parabola)?, sums.1.solve(parabola)?);
+            fits = Some((sums.0.solve(parabola)?, sums.1.solve(parabola)?));
         }
+        let fits = fits?;
         let per_second = 1000.0 / half_ms;
         Some(StampedPose {
             base_from_hand: Transform::new(UnitQuaternion::from_scaled_axis(fits.1.value) * reference, fits.0.value),
@@ -232,6 +234,20 @@ impl PoseBuffer {
             velocity_mm_s: fits.0.slope * per_second,
             angular_velocity_rad_s: fits.1.slope * per_second,
         })
+    }
+
+    /// How far sample `i` lies from the line between its neighbours in the window, mm and rad.
+    fn misfit_among_neighbours(&self, i: usize, from: usize, to: usize) -> (f64, f64) {
+        let (before, after) = match i {
+            _ if i == from => (i + 1, i + 2),
+            _ if i == to => (i - 2, i - 1),
+            _ => (i - 1, i + 1),
+        };
+        let (a, b, own) = (&self.samples[before], &self.samples[after], &self.samples[i]);
+        let t = (own.stamp - a.stamp).seconds() / (b.stamp - a.stamp).seconds();
+        let expected = a.base_from_hand.interpolated(&b.base_from_hand, t);
+        let moved = (own.base_from_hand.translation() - expected.translation()).norm();
+        (moved, (own.base_from_hand.rotation() * expected.rotation().inverse()).angle())
     }
 }
 
@@ -312,14 +328,18 @@ fn residual_scales(residuals: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
         values.sort_unstable_by(f64::total_cmp);
         values.get(values.len() / 2).copied().unwrap_or(0.0)
     };
-    (median(&mut moved[..count]), median(&mut turned[..count]))
+    (median(&mut moved[..count]).max(FINEST_SCALE_MM), median(&mut turned[..count]).max(FINEST_SCALE_RAD))
 }
 
+/// No arm is better than this: without a floor, the onset of a motion after perfect rest would count as an outlier.
+const FINEST_SCALE_MM: f64 = 0.05;
+/// The same for rotation.
+const FINEST_SCALE_RAD: f64 = 2e-4;
 /// Samples whose residuals take part in the robust scale.
 const LARGEST_WINDOW: usize = 128;
 
 fn bisquare(residual: f64, scale: f64) -> f64 {
-    let u = residual / (BISQUARE_REACH * scale + 1e-9);
+    let u = residual / (BISQUARE_REACH * scale);
     if u >= 1.0 { 0.0 } else { (1.0 - u * u).powi(2) }
 }
 

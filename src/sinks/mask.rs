@@ -17,7 +17,10 @@ pub struct MaskSink {
 impl MaskSink {
     /// A sink that writes with `writer`, which was opened for masks.
     pub fn new(writer: VideoWriter) -> Self {
-        Self { writer, untouched: Image::filled(0, 0, provenance_code::UNTOUCHED) }
+        Self {
+            writer,
+            untouched: Image::filled(0, 0, provenance_code::UNTOUCHED),
+        }
     }
 }
 
@@ -31,12 +34,15 @@ impl Sink for MaskSink {
             Some(provenance) => &provenance.code,
             None => {
                 if self.untouched.size() != frame.image.size() {
-                    self.untouched.resize(frame.image.width(), frame.image.height(), provenance_code::UNTOUCHED);
+                    self.untouched
+                        .resize(frame.image.width(), frame.image.height(), provenance_code::UNTOUCHED);
                 }
                 &self.untouched
             }
         };
-        self.writer.write_gray(mask, frame.presented_at).map_err(|error| SinkError(error.to_string()))
+        self.writer
+            .write_gray(mask, frame.presented_at)
+            .map_err(|error| SinkError(error.to_string()))
     }
 
     fn finish(&mut self) -> Result<(), SinkError> {

@@ -26,7 +26,10 @@ impl SideBySideSink {
 
     /// A sink that writes with `writer`, which was opened [`output_width`](Self::output_width) wide.
     pub fn new(writer: VideoWriter) -> Self {
-        Self { writer, canvas: Image::filled(0, 0, DIVIDER) }
+        Self {
+            writer,
+            canvas: Image::filled(0, 0, DIVIDER),
+        }
     }
 }
 
@@ -51,11 +54,19 @@ impl Sink for SideBySideSink {
     }
 
     fn consume(&mut self, frame: &Arc<Frame>) -> Result<(), SinkError> {
-        let Some(original) = frame.original.as_ref().filter(|original| original.size() == frame.image.size()) else {
-            return Err(SinkError("side by side: expected the source to keep each picture as it came, found none".to_owned()));
+        let Some(original) = frame
+            .original
+            .as_ref()
+            .filter(|original| original.size() == frame.image.size())
+        else {
+            return Err(SinkError(
+                "side by side: expected the source to keep each picture as it came, found none".to_owned(),
+            ));
         };
         compose(original, &frame.image, &mut self.canvas);
-        self.writer.write(&self.canvas, frame.presented_at).map_err(|error| SinkError(error.to_string()))
+        self.writer
+            .write(&self.canvas, frame.presented_at)
+            .map_err(|error| SinkError(error.to_string()))
     }
 
     fn finish(&mut self) -> Result<(), SinkError> {

@@ -25,7 +25,9 @@ impl Sink for VideoSink {
     }
 
     fn consume(&mut self, frame: &Arc<Frame>) -> Result<(), SinkError> {
-        self.writer.write(&frame.image, frame.presented_at).map_err(|error| SinkError(error.to_string()))
+        self.writer
+            .write(&frame.image, frame.presented_at)
+            .map_err(|error| SinkError(error.to_string()))
     }
 
     fn finish(&mut self) -> Result<(), SinkError> {

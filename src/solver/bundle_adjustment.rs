@@ -508,9 +508,9 @@ mod tests {
         }
     }
 
-    /// 12 views × 150 points with 0.3 px noise: a pose gathers 150 observations, whose position error is about
-    /// 0.3 px · 75 mm / 860 px / √150 ≈ 0.002 mm sideways, some ten times that along the weakest direction (sideways traded
-    /// against turning over a shallow scene); 0.05 mm is a bound with margin once the gauge is held by exact priors on two views.
+    /// 12 views × 150 points with 0.3 px noise. Sideways steps and turns move the picture alike but for the scene's relief, about
+    /// 4 mm of 75 mm (standard deviation): a position is known to 0.3 px · 75 mm / 860 px / √150 / (4/75) = 0.04 mm, and the
+    /// turn to that over 75 mm, once exact priors on two views hold the gauge. Four standard deviations are the bound.
     #[test]
     fn poses_come_back_from_noise_and_outliers() {
         let mut rng = ChaCha8Rng::seed_from_u64(2);
@@ -540,8 +540,8 @@ mod tests {
         assert!(summary.final_cost < 0.5 * summary.initial_cost);
         for (pose, truth) in problem.poses.iter().zip(&truth.poses) {
             let off = pose.inverse() * truth;
-            assert!(off.translation.vector.norm() < 0.05, "{} mm", off.translation.vector.norm());
-            assert!(off.rotation.angle() < 0.001, "{} rad", off.rotation.angle());
+            assert!(off.translation.vector.norm() < 0.16, "{} mm", off.translation.vector.norm());
+            assert!(off.rotation.angle() < 0.16 / 75.0, "{} rad", off.rotation.angle());
         }
     }
 

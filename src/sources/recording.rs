@@ -37,28 +37,35 @@ pub struct RecordingSource {
 
 impl std::fmt::Debug for RecordingSource {
     fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        formatter.debug_struct("RecordingSource").field("reader", &self.reader).finish_non_exhaustive()
+        formatter
+            .debug_struct("RecordingSource")
+            .field("reader", &self.reader)
+            .finish_non_exhaustive()
     }
 }
 
 impl RecordingSource {
     /// A source that takes its pictures from `pool` and the time of arrival from `clock`.
-    pub fn new(mut reader: VideoReader, playback: Playback, clock: Arc<dyn Clock>, pool: Pool<Rgb8>) -> Result<Self, SourceError> {
-        if let (Some(times), Some(frames)) = (&playback.exposure_times, reader.info().frame_count) {
-            if let Some(at) = times.windows(2).position(|pair| matches!(pair, [a, b] if b <= a)) {
-                return Err(SourceError(format!(
-                    "frames.csv: expected exposure times that increase, found frame {} no later than frame {at}; sort or correct the file",
-                    at + 1
-                )));
-            }
-            if times.len() as u64 != frames {
-                tracing::warn!("frames.csv lists {} frames, the video says it has {frames}; they are matched by number", times.len());
-            }
+    pub fn new(
+        mut reader: VideoReader,
+        playback: Playback,
+        clock: Arc<dyn Clock>,
+        pool: Pool<Rgb8>,
+    ) -> Result<Self, SourceError> {
+        if let Some(times) = &playback.exposure_times {
+            check_exposure_times(times, reader.info().frame_count)?;
         }
         if let Some(start) = playback.start {
             reader.seek(start).map_err(|error| SourceError(error.to_string()))?;
         }
-        Ok(Self { reader, playback, clock, pool, previous: None, ended: false })
+        Ok(Self {
+            reader,
+            playback,
+            clock,
+            pool,
+            previous: None,
+            ended: false,
+        })
     }
 
     /// What is known of the video.
@@ -67,7 +74,9 @@ impl RecordingSource {
     }
 
     fn exposure_of(&mut self, number: u64, stamped: Timestamp) -> Result<Timestamp, SourceError> {
-        let Some(times) = &self.playback.exposure_times else { return Ok(stamped) };
+        let Some(times) = &self.playback.exposure_times else {
+            return Ok(stamped);
+        };
         if let Some(time) = usize::try_from(number).ok().and_then(|n| times.get(n)) {
             return Ok(*time);
         }
@@ -78,6 +87,22 @@ impl RecordingSource {
             times.len()
         )))
     }
+}
+
+fn check_exposure_times(times: &[Timestamp], frames: Option<u64>) -> Result<(), SourceError> {
+    if let Some(at) = times.windows(2).position(|pair| matches!(pair, [a, b] if b <= a)) {
+        return Err(SourceError(format!(
+            "frames.csv: expected exposure times that increase, found frame {} no later than frame {at}; sort or correct the file",
+            at + 1
+        )));
+    }
+    if let Some(frames) = frames.filter(|&frames| frames != times.len() as u64) {
+        tracing::warn!(
+            "frames.csv lists {} frames, the video says it has {frames}; they are matched by number",
+            times.len()
+        );
+    }
+    Ok(())
 }
 
 impl Source for RecordingSource {

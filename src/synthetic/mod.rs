@@ -1,7 +1,11 @@
 //! A world with known answers: organs, a lamp and a camera on an arm, rendered with the truth beside the pictures.
 
+pub mod airborne;
 pub mod arm;
+pub mod board;
+pub mod calibration_scene;
 pub mod export;
+pub mod instrument;
 pub mod light;
 pub mod material;
 pub mod motion;

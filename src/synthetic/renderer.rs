@@ -13,7 +13,10 @@ use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
-use crate::synthetic::light::{Facing, Lamp, Radiance, tissue_radiance};
+use crate::geometry::point::Point;
+use crate::synthetic::airborne::{AIRLIGHT, Smoke, Streak, streaks};
+use crate::synthetic::instrument::{InstrumentHit, Rod, grasper, instrument_hit, unshaded};
+use crate::synthetic::light::{Facing, Lamp, Radiance, steel_radiance, tissue_radiance};
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::scene::World3d;
 use crate::synthetic::sensor::Sensor;
@@ -35,8 +38,21 @@ pub struct Shot {
     pub world_from_camera: Transform<World, Camera>,
     /// Factor on the light.
     pub exposure: f64,
-    /// Seed of the recording's sensor noise.
+    /// Seed of the recording's sensor noise and particles.
     pub noise_key: u64,
+    /// What is in the way.
+    pub obstacles: Obstacles,
+}
+
+/// What comes between scope and tissue.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Obstacles {
+    /// A grasper crosses the field.
+    pub instrument: bool,
+    /// Particles in a frame, on average.
+    pub particles_per_frame: f64,
+    /// A plume of smoke.
+    pub smoke: Option<Smoke>,
 }
 
 /// One frame and its truth.
@@ -44,6 +60,8 @@ pub struct Shot {
 pub struct Rendered {
     /// As the camera delivers it.
     pub video: Image<Rgb8>,
+    /// The same without particles, and 255 where a particle covers more than a tenth; where there are particles.
+    pub without_particles: Option<(Image<Rgb8>, Mask)>,
     /// The truth, if it was asked for.
     pub truth: Option<Truth>,
 }
@@ -59,6 +77,8 @@ pub struct Truth {
     pub specular: Mask,
     /// 255 where an instrument is seen.
     pub instrument: Mask,
+    /// 255 where a particle is seen.
+    pub particles: Mask,
     /// Depth along the optical axis, hundredths of a mm; 0 outside the field.
     pub depth: Image<u16>,
 }
@@ -69,6 +89,8 @@ struct Rays {
     slopes: Vec<[f64; 2]>,
     /// How much of the pixel's light gets through the field stop, 0–1.
     field: Vec<f32>,
+    /// Where the ray lands behind the lens, px.
+    landings: Vec<[f32; 2]>,
 }
 
 /// Renders shots of one world through one camera.
@@ -92,6 +114,14 @@ struct View<'a> {
     rest_eye: Vector3<f64>,
     rest_linear: Matrix3<f64>,
     lamps: Vec<Lamp>,
+    rods: Vec<Rod>,
+}
+
+/// Body and coat of what one ray meets, and whether that is the instrument.
+struct Seen {
+    light: Radiance,
+    depth: f64,
+    is_instrument: bool,
 }
 
 impl Renderer {
@@ -102,7 +132,7 @@ impl Renderer {
         let pinhole = camera.pinhole();
         let seen_through_lens = |pixel: Pixel| {
             let ray = pinhole.unproject(pixel)?;
-            let landing = camera.project(crate::geometry::point::Point::from_coords(ray.coords))?;
+            let landing = camera.project(Point::from_coords(ray.coords))?;
             camera.contains(landing, -0.5).then_some((ray.coords.x, ray.coords.y, landing))
         };
         let pinhole_rays = Rays::new(&camera, seen_through_lens, radius_px);
@@ -133,9 +163,30 @@ impl Renderer {
         mask
     }
 
+    /// Where the ray through a pixel of the video (counted row by row) goes, and how much of it the field stop lets through.
+    pub fn lens_ray(&self, pixel: usize) -> Option<([f64; 2], f32)> {
+        let slope = *self.lens_rays.slopes.get(pixel)?;
+        (!slope[0].is_nan()).then(|| (slope, self.lens_rays.field[pixel]))
+    }
+
+    /// True if `pixel` of the video lies well inside the image field.
+    pub fn in_field(&self, pixel: Pixel) -> bool {
+        const MARGIN_PX: f64 = 4.0;
+        if !self.camera.contains(pixel, MARGIN_PX) {
+            return false;
+        }
+        let reach = [-MARGIN_PX, MARGIN_PX];
+        reach.iter().all(|dx| {
+            reach.iter().all(|dy| {
+                let at = (pixel.y + dy).round() as usize * self.camera.width + (pixel.x + dx).round() as usize;
+                self.lens_rays.field.get(at).is_some_and(|&share| share > 0.99)
+            })
+        })
+    }
+
     /// Samples of the light (linear luma) of a shot at exposure 1, for the exposure loop.
     pub fn metered(&self, seconds: f64, world_from_camera: Transform<World, Camera>) -> Vec<f32> {
-        let view = View::new(&self.world, seconds, world_from_camera);
+        let view = View::new(&self.world, seconds, world_from_camera, false);
         let step = (self.camera.width / 24).max(1);
         let mut samples = Vec::new();
         for y in (step / 2..self.camera.height).step_by(step) {
@@ -156,31 +207,112 @@ impl Renderer {
 
     /// Render a shot, with its truth or without.
     pub fn render(&self, shot: &Shot, with_truth: bool) -> Rendered {
-        let view = View::new(&self.world, shot.seconds, shot.world_from_camera);
-        let video = self.video(&view, shot);
-        let truth = with_truth.then(|| self.truth(&view, shot));
-        Rendered { video, truth }
+        let size = (self.camera.width, self.camera.height);
+        let view = View::new(&self.world, shot.seconds, shot.world_from_camera, shot.obstacles.instrument);
+        let mut light = self.light(&view, shot);
+        let particles = streaks(shot.noise_key, shot.frame, shot.obstacles.particles_per_frame, size);
+        let mut without_particles = None;
+        if shot.obstacles.particles_per_frame > 0.0 {
+            let clean = self.developed(&light, shot);
+            without_particles = Some((clean, self.drawn(&mut light, &particles)));
+        }
+        let video = self.developed(&light, shot);
+        let truth = with_truth.then(|| {
+            let mut truth = self.truth(&view, shot);
+            if let Some((_, mask)) = &without_particles {
+                truth.particles = self.undistorted_mask(mask);
+            }
+            truth
+        });
+        Rendered { video, without_particles, truth }
     }
 
-    fn video(&self, view: &View, shot: &Shot) -> Image<Rgb8> {
-        let (width, height) = (self.camera.width, self.camera.height);
+    /// Light on the sensor, after exposure, through lens and smoke.
+    fn light(&self, view: &View, shot: &Shot) -> Vec<[f32; 3]> {
+        let width = self.camera.width;
         let depths = self.depths(view, &self.lens_rays);
         let exposure = shot.exposure as f32;
-        let mut light = vec![[0.0_f32; 3]; width * height];
+        let mut light = vec![[0.0_f32; 3]; depths.len()];
         for (i, pixel) in light.iter_mut().enumerate() {
-            if depths[i].is_finite() {
-                let radiance = view.radiance(self.lens_rays.slopes[i], depths[i]);
+            if let Some(seen) = view.seen(self.lens_rays.slopes[i], depths[i]) {
                 let through = exposure * self.lens_rays.field[i];
-                *pixel = std::array::from_fn(|k| (radiance.diffuse[k] + radiance.specular[k]) * through);
+                *pixel = std::array::from_fn(|k| (seen.light.diffuse[k] + seen.light.specular[k]) * through);
             }
         }
         soften(&mut light, width);
-        let mut video = Image::filled(width, height, [0_u8; 3]);
+        if let Some(smoke) = &shot.obstacles.smoke {
+            self.veil(&mut light, smoke, shot.seconds);
+        }
+        light
+    }
+
+    /// Smoke over the picture; its density is smooth, so it is computed on a coarse grid and interpolated.
+    fn veil(&self, light: &mut [[f32; 3]], smoke: &Smoke, seconds: f64) {
+        const GRID_PX: usize = 8;
+        let (width, height) = (self.camera.width, self.camera.height);
+        let (columns, rows) = (width / GRID_PX + 2, height / GRID_PX + 2);
+        let across = width as f64;
+        let grid: Vec<f32> = (0..columns * rows)
+            .map(|i| {
+                let x = ((i % columns * GRID_PX) as f64 - 0.5 * across) / across;
+                let y = ((i / columns * GRID_PX) as f64 - 0.5 * height as f64) / across;
+                smoke.transmission(seconds, x, y) as f32
+            })
+            .collect();
+        for (at, pixel) in light.iter_mut().enumerate() {
+            let (x, y) = (at % width, at / width);
+            let corner = y / GRID_PX * columns + x / GRID_PX;
+            let (u, v) = ((x % GRID_PX) as f32 / GRID_PX as f32, (y % GRID_PX) as f32 / GRID_PX as f32);
+            let above = grid[corner] * (1.0 - u) + grid[corner + 1] * u;
+            let below = grid[corner + columns] * (1.0 - u) + grid[corner + columns + 1] * u;
+            let transmission = above * (1.0 - v) + below * v;
+            let through = self.lens_rays.field[at];
+            *pixel = std::array::from_fn(|k| pixel[k] * transmission + AIRLIGHT[k] * through * (1.0 - transmission));
+        }
+    }
+
+    /// Draw particles; 255 where they cover more than a tenth.
+    fn drawn(&self, light: &mut [[f32; 3]], particles: &[Streak]) -> Mask {
+        let (width, height) = (self.camera.width, self.camera.height);
+        let mut mask = Mask::filled(width, height, 0);
+        for streak in particles {
+            let [columns, rows] = streak.extent((width, height));
+            for y in rows {
+                for x in columns.clone() {
+                    let at = y * width + x;
+                    let cover = streak.cover_at(x as f64, y as f64);
+                    if cover > 0.0 && self.lens_rays.field[at] > 0.5 {
+                        light[at] = light[at].map(|v| v + (streak.light - v) * cover);
+                        if cover > 0.1 {
+                            mask.set(x, y, 255);
+                        }
+                    }
+                }
+            }
+        }
+        mask
+    }
+
+    /// From light to pixels, with the noise of the frame.
+    fn developed(&self, light: &[[f32; 3]], shot: &Shot) -> Image<Rgb8> {
+        let mut video = Image::filled(self.camera.width, self.camera.height, [0_u8; 3]);
         let key = hash_u64(shot.noise_key ^ hash_u64(shot.frame));
-        for (i, (pixel, light)) in video.pixels_mut().iter_mut().zip(&light).enumerate() {
+        for (i, (pixel, light)) in video.pixels_mut().iter_mut().zip(light).enumerate() {
             *pixel = self.sensor.noisy(*light, key.wrapping_add(i as u64));
         }
         video
+    }
+
+    /// A mask of the video in the truth's geometry.
+    fn undistorted_mask(&self, mask: &Mask) -> Mask {
+        let mut undistorted = Mask::filled(mask.width(), mask.height(), 0);
+        for (pixel, landing) in undistorted.pixels_mut().iter_mut().zip(&self.pinhole_rays.landings) {
+            if landing[0].is_finite() {
+                let (x, y) = (landing[0].round().max(0.0) as usize, landing[1].round().max(0.0) as usize);
+                *pixel = mask.at(x.min(mask.width() - 1), y.min(mask.height() - 1));
+            }
+        }
+        undistorted
     }
 
     fn truth(&self, view: &View, shot: &Shot) -> Truth {
@@ -190,13 +322,20 @@ impl Renderer {
         let mut body = vec![[0.0_f32; 3]; width * height];
         let mut full = body.clone();
         let mut depth = Image::filled(width, height, 0_u16);
-        for (i, depth) in depth.pixels_mut().iter_mut().enumerate() {
-            if depths[i].is_finite() {
-                *depth = (depths[i] * 100.0).round().clamp(0.0, 65535.0) as u16;
-                let radiance = view.radiance(self.pinhole_rays.slopes[i], depths[i]);
-                let through = exposure * self.pinhole_rays.field[i];
-                body[i] = radiance.diffuse.map(|v| v * through);
-                full[i] = std::array::from_fn(|k| body[i][k] + radiance.specular[k] * through);
+        let mut instrument = Mask::filled(width, height, 0);
+        for i in 0..width * height {
+            let Some(seen) = view.seen(self.pinhole_rays.slopes[i], depths[i]) else {
+                continue;
+            };
+            depth.pixels_mut()[i] = (seen.depth * 100.0).round().clamp(0.0, 65535.0) as u16;
+            let through = exposure * self.pinhole_rays.field[i];
+            full[i] = std::array::from_fn(|k| (seen.light.diffuse[k] + seen.light.specular[k]) * through);
+            // Steel is all reflection: its picture without reflections would be no picture of it.
+            if seen.is_instrument {
+                instrument.pixels_mut()[i] = 255;
+                body[i] = full[i];
+            } else {
+                body[i] = seen.light.diffuse.map(|v| v * through);
             }
         }
         soften(&mut body, width);
@@ -206,12 +345,14 @@ impl Renderer {
         let mut specular = Mask::filled(width, height, 0);
         for i in 0..width * height {
             diffuse.pixels_mut()[i] = self.sensor.clean(body[i]);
-            let levels = |light: [f32; 3]| luma(light.map(|v| self.sensor.level(v)));
-            let excess = (levels(full[i]) - levels(body[i])).round().clamp(0.0, 255.0) as u8;
-            strength.pixels_mut()[i] = excess;
-            specular.pixels_mut()[i] = if excess > SPECULAR_LEVELS { 255 } else { 0 };
+            if instrument.pixels()[i] == 0 {
+                let levels = |light: [f32; 3]| luma(light.map(|v| self.sensor.level(v)));
+                let excess = (levels(full[i]) - levels(body[i])).round().clamp(0.0, 255.0) as u8;
+                strength.pixels_mut()[i] = excess;
+                specular.pixels_mut()[i] = if excess > SPECULAR_LEVELS { 255 } else { 0 };
+            }
         }
-        Truth { diffuse, strength, specular, instrument: Mask::filled(width, height, 0), depth }
+        Truth { diffuse, strength, specular, instrument, particles: Mask::filled(width, height, 0), depth }
     }
 
     /// Depth of every ray, NaN where there is none.
@@ -266,27 +407,32 @@ impl Rays {
     /// `ray_of` gives x, y at z = 1 and where the ray lands behind the lens.
     fn new(camera: &CameraModel, ray_of: impl Fn(Pixel) -> Option<(f64, f64, Pixel)> + Sync, radius_px: Option<f64>) -> Self {
         let centre = Pixel { x: 0.5 * camera.width as f64 - 0.5, y: 0.5 * camera.height as f64 - 0.5 };
-        let rays: Vec<([f64; 2], f32)> = (0..camera.width * camera.height)
+        let rays: Vec<([f64; 2], f32, [f32; 2])> = (0..camera.width * camera.height)
             .into_par_iter()
             .map(|i| {
                 let pixel = Pixel { x: (i % camera.width) as f64, y: (i / camera.width) as f64 };
                 let Some((x, y, landing)) = ray_of(pixel) else {
-                    return ([f64::NAN; 2], 0.0);
+                    return ([f64::NAN; 2], 0.0, [f32::NAN; 2]);
                 };
                 // The field stop is a little out of focus.
                 let share = radius_px.map_or(1.0, |radius| {
                     let beyond = (landing.x - centre.x).hypot(landing.y - centre.y) - radius;
                     (0.5 - beyond / 3.0).clamp(0.0, 1.0)
                 });
-                if share > 0.0 { ([x, y], share as f32) } else { ([f64::NAN; 2], 0.0) }
+                let landing = [landing.x as f32, landing.y as f32];
+                if share > 0.0 { ([x, y], share as f32, landing) } else { ([f64::NAN; 2], 0.0, [f32::NAN; 2]) }
             })
             .collect();
-        Self { slopes: rays.iter().map(|r| r.0).collect(), field: rays.iter().map(|r| r.1).collect() }
+        Self {
+            slopes: rays.iter().map(|r| r.0).collect(),
+            field: rays.iter().map(|r| r.1).collect(),
+            landings: rays.iter().map(|r| r.2).collect(),
+        }
     }
 }
 
 impl<'a> View<'a> {
-    fn new(world: &'a World3d, seconds: f64, world_from_camera: Transform<World, Camera>) -> Self {
+    fn new(world: &'a World3d, seconds: f64, world_from_camera: Transform<World, Camera>, with_instrument: bool) -> Self {
         let scene_from_camera = world.world_from_organs.inverse() * world_from_camera;
         let rotation = scene_from_camera.rotation().to_rotation_matrix().into_inner();
         let eye = scene_from_camera.translation();
@@ -304,7 +450,34 @@ impl<'a> View<'a> {
             rest_eye: rest.linear * eye + rest.offset,
             rest_linear: rest.linear,
             lamps,
+            rods: if with_instrument { grasper(seconds).to_vec() } else { Vec::new() },
         }
+    }
+
+    /// What the ray meets first; `depth` is that of the tissue, NaN where there is none.
+    fn seen(&self, slope: [f64; 2], depth: f64) -> Option<Seen> {
+        if slope[0].is_nan() {
+            return None;
+        }
+        let direction = self.rotation * Vector3::new(slope[0], slope[1], 1.0);
+        if let Some(hit) = instrument_hit(&self.rods, self.eye, direction)
+            && (depth.is_nan() || hit.t < depth)
+        {
+            return Some(Seen { light: self.steel(direction, &hit), depth: hit.t, is_instrument: true });
+        }
+        depth.is_finite().then(|| Seen { light: self.radiance(slope, depth), depth, is_instrument: false })
+    }
+
+    fn steel(&self, direction: Vector3<f64>, hit: &InstrumentHit) -> Radiance {
+        let facing = Facing {
+            at: self.eye + direction * hit.t,
+            normal: hit.normal,
+            film_normal: hit.normal,
+            to_camera: -direction.normalize(),
+        };
+        let light = steel_radiance(&facing, &self.lamps);
+        let finish = hit.finish as f32;
+        Radiance { diffuse: light.diffuse.map(|v| v * finish), specular: light.specular.map(|v| v * finish) }
     }
 
     fn first_depth(&self, slope: [f64; 2]) -> Option<f64> {
@@ -336,7 +509,9 @@ impl<'a> View<'a> {
             film_normal,
             to_camera: -direction.normalize(),
         };
-        tissue_radiance(&facing, &texel, &self.lamps, &self.world.film, |_| 1.0)
+        tissue_radiance(&facing, &texel, &self.lamps, &self.world.film, |lamp| {
+            if self.rods.is_empty() { 1.0 } else { unshaded(&self.rods, facing.at, lamp.at) }
+        })
     }
 }
 
@@ -346,7 +521,7 @@ fn luma(colour: [f32; 3]) -> f32 {
 }
 
 /// The lens's blur: a 3×3 binomial-like kernel, in place.
-fn soften(light: &mut [[f32; 3]], width: usize) {
+pub(super) fn soften(light: &mut [[f32; 3]], width: usize) {
     /// Share of a pixel's light that falls on each of its neighbours along an axis.
     const SPILL: f32 = 0.11;
     let mix = |a: [f32; 3], b: [f32; 3], c: [f32; 3]| -> [f32; 3] {

@@ -33,7 +33,7 @@ pub struct World3d {
 impl World3d {
     /// The organs of `seed` before a scope with two lamps; the finest texture is made for pictures `width` px wide.
     pub fn new(anatomy: Anatomy, seed: u64, width: usize) -> Self {
-        let texel_mm = (0.1 * 960.0 / width.max(1) as f64).clamp(0.06, 0.14);
+        let texel_mm = (0.1 * 960.0 / width.max(1) as f64).clamp(0.06, 0.30);
         let lamp = |x: f64, y: f64, intensity: f64| {
             Lamp {
                 at: Vector3::new(x, y, -0.5),

@@ -7,22 +7,33 @@ use rayon::prelude::*;
 use serde_json::json;
 
 use crate::progress::Progress;
+use crate::synthetic::airborne::Smoke;
 use crate::synthetic::arm::{ArmReading, ArmSettings, arm_readings, hand_from_camera};
+use crate::synthetic::calibration_scene::simulate_boards;
 use crate::synthetic::export::{
     ExportError, camera_yaml, hand_eye_yaml, make_folder, tum_text, write_mask, write_rgb, write_text, write_u16,
 };
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::organs::Anatomy;
-use crate::synthetic::renderer::{Rendered, Renderer, Shot};
+use crate::synthetic::renderer::{Obstacles, Rendered, Renderer, Shot};
 use crate::synthetic::scene::{World3d, laparoscope};
 use crate::synthetic::sensor::AutoExposure;
 use crate::synthetic::trajectory::{Course, Trajectory};
 
+/// What lies before the scope.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Subject {
+    /// Organs.
+    Organs(Anatomy),
+    /// A checkerboard.
+    Board,
+}
+
 /// What to simulate.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Which organs.
-    pub anatomy: Anatomy,
+    /// What lies before the scope.
+    pub subject: Subject,
     /// Everything random follows from it.
     pub seed: u64,
     /// Columns of the pictures.
@@ -43,6 +54,12 @@ pub struct Settings {
     pub heartbeat_mm: f64,
     /// Sensor noise; 1 = about one level.
     pub noise: f64,
+    /// A grasper crosses the live recording.
+    pub instrument: bool,
+    /// Particles in a frame of the live recording, on average.
+    pub particles_per_frame: f64,
+    /// Optical depth of the thickest smoke in the live recording.
+    pub smoke: f64,
     /// Radius of the round image field in widths of the picture; `None` = no field stop.
     pub field_radius: Option<f64>,
 }
@@ -50,7 +67,7 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            anatomy: Anatomy::GallBladder,
+            subject: Subject::Organs(Anatomy::GallBladder),
             seed: 1,
             width: 960,
             height: 540,
@@ -61,6 +78,9 @@ impl Default for Settings {
             breathing_mm: 0.0,
             heartbeat_mm: 0.0,
             noise: 1.0,
+            instrument: false,
+            particles_per_frame: 0.0,
+            smoke: 0.0,
             field_radius: Some(0.47),
         }
     }
@@ -99,7 +119,7 @@ pub struct Summary {
 }
 
 /// The stretch of arm readings before and after the pictures, s.
-const POSE_MARGIN_S: f64 = 0.4;
+pub(super) const POSE_MARGIN_S: f64 = 0.4;
 
 impl Settings {
     fn checked(&self) -> Result<(), SimulationError> {
@@ -128,10 +148,18 @@ struct Plan {
 pub fn simulate(out: &Path, settings: &Settings, progress: &dyn Progress) -> Result<Summary, SimulationError> {
     settings.checked()?;
     let camera = laparoscope(settings.width, settings.height);
-    let mut world = World3d::new(settings.anatomy, settings.seed, settings.width);
+    let anatomy = match settings.subject {
+        Subject::Organs(anatomy) => anatomy,
+        // The board hides them.
+        Subject::Board => Anatomy::Liver,
+    };
+    let mut world = World3d::new(anatomy, settings.seed, settings.width);
     world.motion.breathing_mm = settings.breathing_mm;
     world.motion.heartbeat_mm = settings.heartbeat_mm;
     let renderer = Renderer::new(world, camera, settings.field_radius, settings.noise);
+    if settings.subject == Subject::Board {
+        return simulate_boards(out, settings, &renderer, progress);
+    }
     let mut plans = Vec::new();
     if settings.survey_frames > 0 {
         plans.push(planned("survey", Course::Survey, settings.survey_frames, settings, &renderer));
@@ -161,6 +189,15 @@ fn planned(name: &'static str, course: Course, frames: usize, settings: &Setting
     let exposures = AutoExposure::default().exposures(&metered, renderer.sensor());
     // The survey's noise is not the live recording's.
     let seed = hash_u64(settings.seed ^ hash_u64(name.len() as u64));
+    let obstacles = if course == Course::Survey {
+        Obstacles::default()
+    } else {
+        Obstacles {
+            instrument: settings.instrument,
+            particles_per_frame: settings.particles_per_frame,
+            smoke: (settings.smoke > 0.0).then(|| Smoke::new(seed, settings.smoke, duration_s)),
+        }
+    };
     let shots = times
         .iter()
         .zip(exposures)
@@ -171,6 +208,7 @@ fn planned(name: &'static str, course: Course, frames: usize, settings: &Setting
             world_from_camera: trajectory.world_from_camera(seconds),
             exposure,
             noise_key: seed,
+            obstacles,
         })
         .collect();
     let readings = arm_readings(&settings.arm, seed, -POSE_MARGIN_S, duration_s + POSE_MARGIN_S, |t| {
@@ -186,6 +224,11 @@ fn write_recording(out: &Path, plan: &Plan, settings: &Settings, renderer: &Rend
     make_folder(&folder.join("frames"))?;
     for kind in ["diffuse", "specular", "strength", "instrument", "depth"] {
         make_folder(&truth.join(kind))?;
+    }
+    if plan.shots.iter().any(|shot| shot.obstacles.particles_per_frame > 0.0) {
+        for kind in ["particles", "particles_video", "clean"] {
+            make_folder(&truth.join(kind))?;
+        }
     }
     let mut frames = String::from("frame,timestamp_s\n");
     let mut exposures = String::from("frame,timestamp_s,exposure\n");
@@ -229,11 +272,18 @@ fn render_recording(
             let rendered = renderer.render(shot, true);
             let name = format!("{:06}.png", shot.frame);
             write_rgb(&folder.join(&name), &rendered.video)?;
+            if let Some((clean, mask)) = &rendered.without_particles {
+                write_rgb(&truth.join("clean").join(&name), clean)?;
+                write_mask(&truth.join("particles_video").join(&name), mask)?;
+            }
             if let Some(exact) = &rendered.truth {
                 write_rgb(&truth.join("diffuse").join(&name), &exact.diffuse)?;
                 write_mask(&truth.join("specular").join(&name), &exact.specular)?;
                 write_mask(&truth.join("strength").join(&name), &exact.strength)?;
                 write_mask(&truth.join("instrument").join(&name), &exact.instrument)?;
+                if rendered.without_particles.is_some() {
+                    write_mask(&truth.join("particles").join(&name), &exact.particles)?;
+                }
                 write_u16(&truth.join("depth").join(&name), &exact.depth)?;
             }
             progress.advance(1);
@@ -275,6 +325,9 @@ fn truth_json(settings: &Settings, plans: &[Plan], summary: &Summary) -> String 
             "<recording>/specular/%06d.png": "255 where the full picture is more than 12 levels (luma) above the diffuse one",
             "<recording>/strength/%06d.png": "levels (luma) above the diffuse picture",
             "<recording>/instrument/%06d.png": "255 where an instrument is seen",
+            "<recording>/particles/%06d.png": "255 where a particle is seen, if there are any",
+            "<recording>/particles_video/%06d.png": "the same in the video's own, distorted geometry",
+            "<recording>/clean/%06d.png": "the video's frame without particles, same noise, in the video's own geometry",
             "<recording>/depth/%06d.png": "16-bit, hundredths of a mm along the optical axis; 0 outside the field",
             "<recording>/camera_poses.tum": "T_world_camera at each frame's exposure",
             "<recording>/hand_poses.tum": "T_base_hand, exact, on the camera's clock",
@@ -289,6 +342,11 @@ fn truth_json(settings: &Settings, plans: &[Plan], summary: &Summary) -> String 
             "rotation_noise_rad": settings.arm.rotation_noise_rad,
         },
         "motion": { "breathing_mm": settings.breathing_mm, "heartbeat_mm": settings.heartbeat_mm },
+        "obstacles": {
+            "instrument": settings.instrument,
+            "particles_per_frame": settings.particles_per_frame,
+            "smoke_optical_depth": settings.smoke,
+        },
         "specular_share": summary.specular_share,
         "mean_level": summary.mean_level,
     });

@@ -1,0 +1,157 @@
+//! The arm's pose corrected by the picture: a degree of joint error is thirty pixels of tissue, so the arm is only a prior.
+//!
+//! The correction of one frame starts the next: what the arm gets wrong (its clock, its joints) changes slowly. Without an arm, the
+//! last pose starts the next, and a frame that is lost is looked for among the light field's views.
+
+use std::sync::Arc;
+
+use crate::frame::{Alignment, Frame, PoseOrigin};
+use crate::geometry::space::{Camera, World};
+use crate::geometry::transform::Transform;
+use crate::image::blur::BlurScratch;
+use crate::light_field::view::LightField;
+use crate::localization::detail::DetailPyramid;
+use crate::localization::image_alignment::{self, ImageAligner};
+use crate::pipeline::stage::{Stage, StageError};
+
+/// How far the picture may overrule the arm.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// A refined pose farther than this from the arm's is not believed, mm.
+    pub max_correction_mm: f64,
+    /// A refined pose turned more than this from the arm's is not believed, rad.
+    pub max_correction_rad: f64,
+    /// How a picture is laid against the views.
+    pub alignment: image_alignment::Settings,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            max_correction_mm: 12.0,
+            max_correction_rad: 0.12,
+            alignment: image_alignment::Settings::default(),
+        }
+    }
+}
+
+/// Corrects `frame.world_from_camera`.
+#[derive(Debug)]
+pub struct PoseRefinement {
+    settings: Settings,
+    light_field: Arc<LightField>,
+    aligner: ImageAligner,
+    pyramid: DetailPyramid,
+    scratch: BlurScratch,
+    /// Right-multiplied to the arm's pose: refined = arm · correction.
+    correction: Option<Transform<Camera, Camera>>,
+    last: Option<Transform<World, Camera>>,
+}
+
+impl PoseRefinement {
+    /// Against the given light field.
+    pub fn new(settings: &Settings, light_field: Arc<LightField>) -> Self {
+        Self {
+            settings: settings.clone(),
+            aligner: ImageAligner::new(&light_field, &settings.alignment),
+            light_field,
+            pyramid: DetailPyramid::default(),
+            scratch: BlurScratch::default(),
+            correction: None,
+            last: None,
+        }
+    }
+
+    /// The best start among the arm's pose, that pose with the last correction, and the last pose.
+    fn best_guess(&mut self, frame: &Frame, camera: &crate::camera::model::CameraModel) -> Option<Transform<World, Camera>> {
+        let prior = frame.world_from_camera;
+        let corrected = prior.zip(self.correction).map(|(arm, correction)| arm * correction);
+        let mut best: Option<(f32, Transform<World, Camera>)> = None;
+        for pose in [corrected, prior, self.last].into_iter().flatten() {
+            let score = self.aligner.coarse_score(&self.pyramid, camera, &pose);
+            if best.is_none_or(|(found, _)| score > found) {
+                best = Some((score, pose));
+            }
+        }
+        if best.is_none_or(|(score, _)| score < 0.1) && prior.is_none() {
+            for index in 0..self.light_field.views.len() {
+                let pose = self.light_field.views[index].world_from_camera;
+                let score = self.aligner.coarse_score(&self.pyramid, camera, &pose);
+                if best.is_none_or(|(found, _)| score > found) {
+                    best = Some((score, pose));
+                }
+            }
+        }
+        best.map(|(_, pose)| pose)
+    }
+
+    fn is_believable(&self, refined: &Transform<World, Camera>, prior: Option<&Transform<World, Camera>>) -> bool {
+        prior.is_none_or(|prior| {
+            let away = prior.inverse() * *refined;
+            away.translation().norm() <= self.settings.max_correction_mm
+                && away.rotation().angle() <= self.settings.max_correction_rad
+        })
+    }
+}
+
+impl Stage for PoseRefinement {
+    fn name(&self) -> &'static str {
+        "pose_refinement"
+    }
+
+    fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
+        let Some(camera) = frame.camera.clone() else {
+            return Err(StageError(
+                "the frame has no calibrated camera: give the recording a camera.yaml".into(),
+            ));
+        };
+        if frame.scene_cut {
+            self.reset();
+        }
+        {
+            let specular = frame.specularities.as_deref();
+            let instruments = frame.instruments.as_deref();
+            let field = frame.field_of_view.as_deref();
+            let usable = |x: usize, y: usize| {
+                specular.is_none_or(|m| m.at(x, y) == 0)
+                    && instruments.is_none_or(|m| m.at(x, y) == 0)
+                    && field.is_none_or(|m| m.at(x, y) != 0)
+            };
+            self.pyramid.build(&frame.image, &usable, &mut self.scratch);
+        }
+        let prior = frame.world_from_camera;
+        let aligned = self
+            .best_guess(frame, &camera)
+            .and_then(|guess| self.aligner.align(&self.pyramid, &camera, &guess, prior.as_ref()))
+            .filter(|found| self.is_believable(&found.world_from_camera, prior.as_ref()));
+        let Some(found) = aligned else {
+            frame.alignment = Some(Alignment::default());
+            self.last = None;
+            return Ok(());
+        };
+        self.correction = prior.map(|prior| prior.inverse() * found.world_from_camera);
+        self.last = Some(found.world_from_camera);
+        if prior.is_none() {
+            frame.pose_origin = PoseOrigin::Predicted;
+        }
+        let correction_px = prior.map_or(0.0, |prior| {
+            let away = prior.inverse() * found.world_from_camera;
+            // A turn moves the whole picture; a shift moves it by what it is at the scene, which `moved_px` measured from the guess.
+            found.moved_px.max((camera.intrinsics.fx * away.rotation().angle()) as f32)
+        });
+        frame.world_from_camera = Some(found.world_from_camera);
+        frame.alignment = Some(Alignment {
+            correlation: found.correlation,
+            correction_px,
+            aligned: true,
+            ..Alignment::default()
+        });
+        Ok(())
+    }
+
+    fn reset(&mut self) {
+        self.correction = None;
+        self.last = None;
+    }
+}
