@@ -15,7 +15,6 @@ mod undistortion;
 mod media;
 #![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
 
-mod architecture;
 mod cli;
 mod color;
 mod config;

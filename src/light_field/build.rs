@@ -11,6 +11,7 @@ use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Rgb8};
 use crate::light_field::confidence::confidence_of;
+use crate::light_field::cross_examination;
 use crate::light_field::depth::stereo::{DepthMap, Stereo, StereoSettings, confirmed, depth_maps};
 use crate::light_field::error::LightFieldError;
 use crate::light_field::file::{self, Origin};
@@ -126,6 +127,7 @@ pub fn complete(light_field: &mut LightField, settings: &BuildSettings, progress
         view.gain = *gain;
     }
     light_field.shading = photometry.shading;
+    cross_examination::refine_confidence(light_field);
     Ok(CompletionReport {
         depth_maps: maps.len(),
         vertices: light_field.surface.vertices.len(),

@@ -23,6 +23,9 @@ const SIGHTING_WORTH: f64 = 0.5;
 /// The first sighting of a place is worth more than the second, and that more than the third.
 const WORTH_OF_NEXT: [f64; WANTED_SIGHTINGS] = [1.0, 0.2, 0.1];
 
+/// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
+const HEARD_FROM: u8 = 25;
+
 /// Relative difference of depth beyond which a view sees something else.
 const OCCLUSION_TOLERANCE: f32 = 0.03;
 
@@ -149,7 +152,7 @@ fn places_seen(view: &View, places: &[Vector3<f64>]) -> u64 {
                 && y >= 0.0
                 && x < view.camera.width as f64
                 && y < view.camera.height as f64
-                && view.confidence.at(x as usize, y as usize) > 128
+                && view.confidence.at(x as usize, y as usize) >= HEARD_FROM
                 && is_unoccluded(view.depth.at(x as usize, y as usize), p.coords.z as f32)
         });
         bits |= u64::from(seen) << index;

@@ -7,12 +7,13 @@ use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::blur::BlurScratch;
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::light_field::mapping::Mapping;
 use crate::light_field::view::LightField;
 use crate::stages::specularity_substitution::brightness::LogRatio;
 use crate::stages::specularity_substitution::candidates::{Candidate, CandidateSearch, MAX_PLACES, MAX_VIEWS};
 use crate::stages::specularity_substitution::ring::{Detail, luminance, shift_between};
 use crate::stages::specularity_substitution::stage::Settings;
-use crate::stages::specularity_substitution::warp::{Mapping, WarpedView, Window};
+use crate::stages::specularity_substitution::warp::{WarpedView, Window};
 
 /// What a region looks at of the live frame.
 #[derive(Clone, Copy, Debug)]
