@@ -66,14 +66,25 @@ fn main() -> std::process::ExitCode {
         println!("{fault}");
     }
     println!("no_allocation_per_frame ... {}", if failed == 0 { "ok" } else { "FAILED" });
-    println!("\ntest result: {}. {} passed; {failed} failed", if failed == 0 { "ok" } else { "FAILED" }, 1 - failed);
+    println!(
+        "\ntest result: {}. {} passed; {failed} failed",
+        if failed == 0 { "ok" } else { "FAILED" },
+        1 - failed
+    );
     std::process::ExitCode::from(failed as u8)
 }
 
 /// One line for each stage that allocated.
 fn allocations() -> Vec<String> {
-    let recording = Recording { camera: Some(scene::laparoscope(SIZE.0, SIZE.1)), ..Recording::plain(Video::File("none".into())) };
-    let equipment = Equipment { recording: &recording, light_field: None, size: SIZE };
+    let recording = Recording {
+        camera: Some(scene::laparoscope(SIZE.0, SIZE.1)),
+        ..Recording::plain(Video::File("none".into()))
+    };
+    let equipment = Equipment {
+        recording: &recording,
+        light_field: None,
+        size: SIZE,
+    };
     let mut line = compose::line(&Config::default(), &Choice::ALL, &equipment).expect("the default line stands");
     let pictures: Vec<_> = (0..8).map(|number| scene::picture(SIZE.0, SIZE.1, number)).collect();
     let pool = Pool::new(4);

@@ -14,8 +14,15 @@ use crate::support::scene::{Wandering, laparoscope};
 
 fn run_once() -> Seen {
     let (width, height) = (192, 128);
-    let recording = Recording { camera: Some(laparoscope(width, height)), ..Recording::plain(Video::File("none".into())) };
-    let equipment = Equipment { recording: &recording, light_field: None, size: (width, height) };
+    let recording = Recording {
+        camera: Some(laparoscope(width, height)),
+        ..Recording::plain(Video::File("none".into()))
+    };
+    let equipment = Equipment {
+        recording: &recording,
+        light_field: None,
+        size: (width, height),
+    };
     let line = compose::line(&Config::default(), &Choice::ALL, &equipment).unwrap();
     assert!(line.stages.len() >= 3, "the line has its stages");
     let (sink, seen) = Keeping::new("sink");
@@ -23,7 +30,13 @@ fn run_once() -> Seen {
     for stage in line.stages {
         builder = builder.stage(stage);
     }
-    let outcome = builder.sink(Box::new(sink), Queue::blocking(2)).build().unwrap().start().unwrap().wait();
+    let outcome = builder
+        .sink(Box::new(sink), Queue::blocking(2))
+        .build()
+        .unwrap()
+        .start()
+        .unwrap()
+        .wait();
     assert!(outcome.faults().is_empty(), "{:?}", outcome.faults());
     assert!(outcome.stages.iter().all(|stage| stage.failures == 0), "{:?}", outcome.stages);
     seen

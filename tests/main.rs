@@ -2,17 +2,17 @@
 
 mod architecture;
 mod camera;
-mod recording;
-mod robot;
-mod undistortion;
-mod media;
 mod cli;
 mod color;
 mod config;
 mod determinism;
 mod light_field;
+mod media;
 mod pipeline;
+mod recording;
+mod robot;
 mod support;
-mod temporal_median;
 mod survey;
 mod synthetic;
+mod temporal_median;
+mod undistortion;

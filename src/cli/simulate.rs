@@ -11,8 +11,10 @@ use crate::synthetic::simulation::{Settings, Subject, simulate};
 
 /// Make recordings of a simulated operation, with exact truth.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  endofield simulate /tmp/operation --scene gall --size 960x540 --frames 100\n\n\
-    writes /tmp/operation/survey and /tmp/operation/live (recordings) and /tmp/operation/truth.")]
+#[command(
+    after_help = "Example:\n  endofield simulate /tmp/operation --scene gall --size 960x540 --frames 100\n\n\
+    writes /tmp/operation/survey and /tmp/operation/live (recordings) and /tmp/operation/truth."
+)]
 pub struct Args {
     /// Folder to make.
     out: PathBuf,
@@ -86,7 +88,12 @@ struct Size {
 }
 
 fn size_from_text(text: &str) -> Result<Size, String> {
-    let parsed = text.split_once('x').and_then(|(w, h)| Some(Size { width: w.parse().ok()?, height: h.parse().ok()? }));
+    let parsed = text.split_once('x').and_then(|(w, h)| {
+        Some(Size {
+            width: w.parse().ok()?,
+            height: h.parse().ok()?,
+        })
+    });
     parsed.ok_or_else(|| format!("expected WIDTHxHEIGHT such as 960x540, found `{text}`"))
 }
 
@@ -123,8 +130,7 @@ pub fn run(args: Args, progress: &dyn Progress) -> anyhow::Result<()> {
         field_radius: (!args.full_frame).then_some(0.47),
         ..Settings::default()
     };
-    let summary = simulate(&args.out, &settings, progress)
-        .with_context(|| format!("simulating into {}", args.out.display()))?;
+    let summary = simulate(&args.out, &settings, progress).with_context(|| format!("simulating into {}", args.out.display()))?;
     tracing::info!(
         frames = summary.frames,
         specular_percent = summary.specular_share * 100.0,

@@ -12,7 +12,7 @@ pub mod patch;
 pub mod pool;
 pub mod pyramid;
 pub mod remap;
-mod remap_bilinear;
 mod remap_bicubic;
+mod remap_bilinear;
 pub mod specularity;
 pub mod wide;

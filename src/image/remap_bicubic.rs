@@ -32,7 +32,11 @@ const fn weights() -> [[i32; 4]; 32] {
 }
 
 const fn rounded(value: f64) -> i32 {
-    if value < 0.0 { (value - 0.5) as i32 } else { (value + 0.5) as i32 }
+    if value < 0.0 {
+        (value - 0.5) as i32
+    } else {
+        (value + 0.5) as i32
+    }
 }
 
 /// One output row.
@@ -47,7 +51,15 @@ pub(crate) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mu
             let (at, fx, fy) = unpacked(*entry, *base);
             let (x, y) = (at % width, at / width);
             *out = inner(source, x, y, fx as usize, fy as usize).unwrap_or_else(|| {
-                at_border(source, Place { x: x as i32, y: y as i32, fx: fx as u8, fy: fy as u8 })
+                at_border(
+                    source,
+                    Place {
+                        x: x as i32,
+                        y: y as i32,
+                        fx: fx as u8,
+                        fy: fy as u8,
+                    },
+                )
             });
         }
     }
@@ -103,7 +115,12 @@ mod tests {
 
     #[test]
     fn a_constant_stays_and_a_line_stays() {
-        let source = Image::from_vec(40, 40, (0..1600).map(|i| [77, (i % 40 * 6) as u8, (i / 40 * 5) as u8]).collect()).unwrap();
+        let source = Image::from_vec(
+            40,
+            40,
+            (0..1600).map(|i| [77, (i % 40 * 6) as u8, (i / 40 * 5) as u8]).collect(),
+        )
+        .unwrap();
         let table = RemapTable::new((30, 30), (40, 40), |x, y| Some((x as f64 + 4.41, y as f64 + 5.23))).unwrap();
         let mut out = Image::filled(0, 0, [0; 3]);
         table.remap_rgb(&source, &mut out, Interpolation::Bicubic).unwrap();
@@ -120,8 +137,18 @@ mod tests {
 
     #[test]
     fn row_and_border_kernels_agree() {
-        let source = Image::from_vec(24, 16, (0..384_u32).map(|i| [(i * 7 % 251) as u8, (i * 13 % 241) as u8, (i * 29 % 239) as u8]).collect()).unwrap();
-        let table = RemapTable::new((24, 16), (24, 16), |x, y| Some((x as f64 * 1.02 - 0.6, y as f64 * 0.97 + 0.3))).unwrap();
+        let source = Image::from_vec(
+            24,
+            16,
+            (0..384_u32)
+                .map(|i| [(i * 7 % 251) as u8, (i * 13 % 241) as u8, (i * 29 % 239) as u8])
+                .collect(),
+        )
+        .unwrap();
+        let table = RemapTable::new((24, 16), (24, 16), |x, y| {
+            Some((x as f64 * 1.02 - 0.6, y as f64 * 0.97 + 0.3))
+        })
+        .unwrap();
         let mut out = Image::filled(0, 0, [0; 3]);
         table.remap_rgb(&source, &mut out, Interpolation::Bicubic).unwrap();
         for y in 0..16 {

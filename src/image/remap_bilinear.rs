@@ -49,7 +49,10 @@ mod avx2 {
     use crate::image::remap::{BLOCK, OUTSIDE, unpacked};
 
     pub(super) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
-        #[expect(unsafe_code, reason = "AVX2 makes the remap of a 1080p frame several times faster; see benches")]
+        #[expect(
+            unsafe_code,
+            reason = "AVX2 makes the remap of a 1080p frame several times faster; see benches"
+        )]
         // SAFETY: `row_kernel` hands this function out only where the machine has AVX2.
         unsafe {
             row_avx2(entries, bases, source, out);
@@ -79,13 +82,21 @@ mod avx2 {
     #[inline]
     #[target_feature(enable = "avx2")]
     fn four(quad: &[u32; 4], base: u32, bytes: &[u8], stride: usize) -> [Rgb8; 4] {
-        let sums = [two(quad[0], quad[1], base, bytes, stride), two(quad[2], quad[3], base, bytes, stride)];
+        let sums = [
+            two(quad[0], quad[1], base, bytes, stride),
+            two(quad[2], quad[3], base, bytes, stride),
+        ];
         // Lane 0: pixels 0 and 2, lane 1: pixels 1 and 3; each r g b 0.
         let words = _mm256_packus_epi32(sums[0], sums[1]);
         let packed = _mm256_packus_epi16(words, words);
         let even = _mm256_extract_epi64::<0>(packed).to_le_bytes();
         let odd = _mm256_extract_epi64::<2>(packed).to_le_bytes();
-        [[even[0], even[1], even[2]], [odd[0], odd[1], odd[2]], [even[4], even[5], even[6]], [odd[4], odd[5], odd[6]]]
+        [
+            [even[0], even[1], even[2]],
+            [odd[0], odd[1], odd[2]],
+            [even[4], even[5], even[6]],
+            [odd[4], odd[5], odd[6]],
+        ]
     }
 
     /// Two output pixels, r g b 0 in 32 bits each, one a lane.
@@ -96,7 +107,10 @@ mod avx2 {
         let (at1, fx1, fy1) = unpacked(second, base);
         let load = |at: usize| {
             // The table holds only pixels with room for eight bytes in both rows; anything else would be a bug, and black.
-            bytes.get(at..).and_then(|rest| rest.first_chunk::<8>()).map_or(0, |chunk| i64::from_le_bytes(*chunk))
+            bytes
+                .get(at..)
+                .and_then(|rest| rest.first_chunk::<8>())
+                .map_or(0, |chunk| i64::from_le_bytes(*chunk))
         };
         let (at0, at1) = (3 * at0, 3 * at1);
         let neighbours = _mm256_set_epi64x(load(at1 + stride), load(at1), load(at0 + stride), load(at0));
@@ -130,7 +144,9 @@ mod tests {
 
     /// The plainest possible: f64, at the position that the table says.
     fn reference(table: &RemapTable, source: &Image<Rgb8>, x: usize, y: usize) -> [f64; 3] {
-        let Some((sx, sy)) = table.position(x, y) else { return [0.0; 3] };
+        let Some((sx, sy)) = table.position(x, y) else {
+            return [0.0; 3];
+        };
         let at = |x: f64, y: f64, c: usize| {
             if x < 0.0 || y < 0.0 || x >= source.width() as f64 || y >= source.height() as f64 {
                 0.0
@@ -148,7 +164,10 @@ mod tests {
 
     #[test]
     fn agrees_with_the_plain_twin() {
-        for (seed, (w, h)) in [(67, 41), (128, 64), (3, 3), (1, 5), (2, 2), (200, 9)].into_iter().enumerate() {
+        for (seed, (w, h)) in [(67, 41), (128, 64), (3, 3), (1, 5), (2, 2), (200, 9)]
+            .into_iter()
+            .enumerate()
+        {
             let source = noise(w, h, seed as u64);
             let table = RemapTable::new((w + 3, h), (w, h), |x, y| {
                 let (x, y) = (x as f64, y as f64);
@@ -174,7 +193,13 @@ mod tests {
         let source = noise(131, 57, 9);
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
         let entries: Vec<u32> = (0..131)
-            .map(|_| if rng.random_bool(0.1) { OUTSIDE } else { rng.random_range(0..131 * 55) << 10 | rng.random_range(0..1024) })
+            .map(|_| {
+                if rng.random_bool(0.1) {
+                    OUTSIDE
+                } else {
+                    rng.random_range(0..131 * 55) << 10 | rng.random_range(0..1024)
+                }
+            })
             .collect();
         let (mut plain, mut fast) = (vec![[1; 3]; 131], vec![[2; 3]; 131]);
         row(&entries, &[5, 0, 70], &source, &mut plain);

@@ -66,9 +66,7 @@ pub fn arm_readings(
 ) -> Vec<ArmReading> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     // The standard deviations come checked; a normal distribution of a finite deviation always exists.
-    let deviate = |random: &mut ChaCha8Rng, sigma: f64| {
-        Normal::new(0.0, sigma).map_or(0.0, |normal| normal.sample(random))
-    };
+    let deviate = |random: &mut ChaCha8Rng, sigma: f64| Normal::new(0.0, sigma).map_or(0.0, |normal| normal.sample(random));
     let camera_from_hand = hand_from_camera(settings.scope_mm).inverse();
     let count = ((to_s - from_s) * settings.rate_hz).ceil() as usize + 1;
     (0..count)

@@ -21,15 +21,38 @@ use crate::synthetic::trajectory::{Course, Trajectory};
 const EXPOSURE: f64 = 0.9;
 
 /// Write both recordings and their truth into `out`.
-pub fn simulate_boards(out: &Path, settings: &Settings, renderer: &Renderer, progress: &dyn Progress) -> Result<Summary, SimulationError> {
+pub fn simulate_boards(
+    out: &Path,
+    settings: &Settings,
+    renderer: &Renderer,
+    progress: &dyn Progress,
+) -> Result<Summary, SimulationError> {
     let at_rest = Trajectory::new(Course::Still, 1.0, renderer.world().world_from_organs).world_from_camera(0.0);
     let world_from_board: Transform<World, Board> = at_rest * station(0.0).inverse();
     let still = move |_: f64| at_rest;
     let carried = move |seconds: f64| world_from_board * station(seconds);
     let mut summary = Summary::default();
-    summary.frames += write_board_recording(out, "survey", settings.survey_frames, settings, renderer, progress, &still, &waved)?;
+    summary.frames += write_board_recording(
+        out,
+        "survey",
+        settings.survey_frames,
+        settings,
+        renderer,
+        progress,
+        &still,
+        &waved,
+    )?;
     let seen = move |seconds: f64| station(seconds).inverse();
-    summary.frames += write_board_recording(out, "live", settings.live_frames, settings, renderer, progress, &carried, &seen)?;
+    summary.frames += write_board_recording(
+        out,
+        "live",
+        settings.live_frames,
+        settings,
+        renderer,
+        progress,
+        &carried,
+        &seen,
+    )?;
     let truth = json!({
         "unit": "mm",
         "seed": settings.seed,
@@ -46,7 +69,10 @@ pub fn simulate_boards(out: &Path, settings: &Settings, renderer: &Renderer, pro
     Ok(summary)
 }
 
-#[expect(clippy::too_many_arguments, reason = "one recording is these things; a struct for one call would only rename them")]
+#[expect(
+    clippy::too_many_arguments,
+    reason = "one recording is these things; a struct for one call would only rename them"
+)]
 fn write_board_recording(
     out: &Path,
     name: &str,
@@ -65,13 +91,23 @@ fn write_board_recording(
     make_folder(&truth)?;
     let seconds = |frame: usize| frame as f64 / settings.frame_rate_hz;
     let seed = hash_u64(settings.seed ^ hash_u64(name.len() as u64));
-    let readings = arm_readings(&settings.arm, seed, -POSE_MARGIN_S, seconds(frames) + POSE_MARGIN_S, world_from_camera);
+    let readings = arm_readings(
+        &settings.arm,
+        seed,
+        -POSE_MARGIN_S,
+        seconds(frames) + POSE_MARGIN_S,
+        world_from_camera,
+    );
     let mut stamps = String::from("frame,timestamp_s\n");
     let mut found = String::from("frame,corner,x_px,y_px,board_x_mm,board_y_mm\n");
     for frame in 0..frames {
         // Writing to a String cannot fail.
         let _infallible = writeln!(stamps, "{frame},{:.6}", seconds(frame));
-        for (number, corner) in corners(renderer, &camera_from_board(seconds(frame))).unwrap_or_default().iter().enumerate() {
+        for (number, corner) in corners(renderer, &camera_from_board(seconds(frame)))
+            .unwrap_or_default()
+            .iter()
+            .enumerate()
+        {
             let _infallible = writeln!(
                 found,
                 "{frame},{number},{:.5},{:.5},{},{}",
@@ -81,14 +117,23 @@ fn write_board_recording(
     }
     write_text(&folder.join("frames.csv"), &stamps)?;
     write_text(&truth.join("corners.csv"), &found)?;
-    write_text(&folder.join("poses.tum"), &tum_text("T_base_hand, mm", readings.iter().map(|r| (r.stamp_s, r.base_from_hand))))?;
+    write_text(
+        &folder.join("poses.tum"),
+        &tum_text("T_base_hand, mm", readings.iter().map(|r| (r.stamp_s, r.base_from_hand))),
+    )?;
     let exact = (0..frames).map(|frame| (seconds(frame), world_from_camera(seconds(frame))));
     write_text(&truth.join("camera_poses.tum"), &tum_text("T_world_camera, mm", exact))?;
     let boards = (0..frames).map(|frame| (seconds(frame), camera_from_board(seconds(frame))));
     write_text(&truth.join("board_poses.tum"), &tum_text("T_camera_board, mm", boards))?;
     // Calibration is what these recordings are for: its results are the truth, not part of the recording.
-    write_text(&truth.join("camera.yaml"), &camera_yaml(renderer.camera(), "simulated_laparoscope"))?;
-    write_text(&truth.join("hand_eye.yaml"), &hand_eye_yaml(&hand_from_camera(settings.arm.scope_mm)))?;
+    write_text(
+        &truth.join("camera.yaml"),
+        &camera_yaml(renderer.camera(), "simulated_laparoscope"),
+    )?;
+    write_text(
+        &truth.join("hand_eye.yaml"),
+        &hand_eye_yaml(&hand_from_camera(settings.arm.scope_mm)),
+    )?;
     progress.begin(&format!("rendering {name}"), frames as u64);
     let outcome = (0..frames).into_par_iter().try_for_each(|frame| {
         if progress.stopping() {

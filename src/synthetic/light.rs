@@ -37,7 +37,12 @@ pub struct Film {
 
 impl Default for Film {
     fn default() -> Self {
-        Self { f0: 0.03, narrow_alpha: 0.055, wide_alpha: 0.22, wide_share: 0.35 }
+        Self {
+            f0: 0.03,
+            narrow_alpha: 0.055,
+            wide_alpha: 0.22,
+            wide_share: 0.35,
+        }
     }
 }
 
@@ -72,17 +77,14 @@ pub fn arriving(lamp: &Lamp, at: Vector3<f64>) -> (Vector3<f64>, f64) {
     let squared = way.norm_squared();
     let to_lamp = way / squared.sqrt();
     let off_axis = (-to_lamp.dot(&lamp.axis)).max(0.0);
-    (to_lamp, lamp.intensity * off_axis.powi(lamp.exponent) * REFERENCE_MM * REFERENCE_MM / squared)
+    (
+        to_lamp,
+        lamp.intensity * off_axis.powi(lamp.exponent) * REFERENCE_MM * REFERENCE_MM / squared,
+    )
 }
 
 /// What `texel` sends to the camera under `lamps`; `shade` gives each lamp's visibility, 0–1.
-pub fn tissue_radiance(
-    facing: &Facing,
-    texel: &Texel,
-    lamps: &[Lamp],
-    film: &Film,
-    shade: impl Fn(&Lamp) -> f64,
-) -> Radiance {
+pub fn tissue_radiance(facing: &Facing, texel: &Texel, lamps: &[Lamp], film: &Film, shade: impl Fn(&Lamp) -> f64) -> Radiance {
     let mut radiance = Radiance::default();
     for lamp in lamps {
         let (to_lamp, strength) = arriving(lamp, facing.at);
@@ -128,7 +130,12 @@ fn lobe(n_h: f64, n_l: f64, n_v: f64, alpha: f64) -> f64 {
 
 /// A steel surface: almost no body, a strong brushed coat.
 pub fn steel_radiance(facing: &Facing, lamps: &[Lamp]) -> Radiance {
-    const STEEL: Film = Film { f0: 0.55, narrow_alpha: 0.16, wide_alpha: 0.45, wide_share: 0.6 };
+    const STEEL: Film = Film {
+        f0: 0.55,
+        narrow_alpha: 0.16,
+        wide_alpha: 0.45,
+        wide_share: 0.6,
+    };
     let mut radiance = Radiance::default();
     for lamp in lamps {
         let (to_lamp, strength) = arriving(lamp, facing.at);
@@ -150,7 +157,12 @@ mod tests {
     #[test]
     fn the_coat_gives_back_no_more_than_it_gets() {
         // Directional albedo by quadrature over the hemisphere: below 1, near F0 for a smooth coat.
-        let film = Film { f0: 1.0, narrow_alpha: 0.3, wide_alpha: 0.3, wide_share: 0.0 };
+        let film = Film {
+            f0: 1.0,
+            narrow_alpha: 0.3,
+            wide_alpha: 0.3,
+            wide_share: 0.0,
+        };
         for tilt in [0.0_f64, 0.5, 1.0] {
             let facing = Facing {
                 at: Vector3::zeros(),
@@ -164,8 +176,8 @@ mod tests {
                 for j in 0..2 * steps {
                     let phi = f64::from(j) / f64::from(steps) * std::f64::consts::PI;
                     let to_lamp = Vector3::new(theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos());
-                    let area = theta.sin() * std::f64::consts::FRAC_PI_2 / f64::from(steps) * std::f64::consts::PI
-                        / f64::from(steps);
+                    let area =
+                        theta.sin() * std::f64::consts::FRAC_PI_2 / f64::from(steps) * std::f64::consts::PI / f64::from(steps);
                     sum += coat(&facing, to_lamp, &film) / std::f64::consts::PI * area;
                 }
             }
@@ -175,15 +187,24 @@ mod tests {
 
     #[test]
     fn a_white_wall_at_the_reference_distance_shines_with_radiance_one() {
-        let lamp =
-            Lamp { at: Vector3::zeros(), axis: Vector3::z(), intensity: 1.0, colour: [1.0; 3], exponent: 2 };
+        let lamp = Lamp {
+            at: Vector3::zeros(),
+            axis: Vector3::z(),
+            intensity: 1.0,
+            colour: [1.0; 3],
+            exponent: 2,
+        };
         let facing = Facing {
             at: Vector3::new(0.0, 0.0, REFERENCE_MM),
             normal: -Vector3::z(),
             film_normal: -Vector3::z(),
             to_camera: -Vector3::z(),
         };
-        let white = Texel { albedo: [1.0; 3], gloss: 0.0, film: [0.0; 2] };
+        let white = Texel {
+            albedo: [1.0; 3],
+            gloss: 0.0,
+            film: [0.0; 2],
+        };
         let radiance = tissue_radiance(&facing, &white, &[lamp], &Film::default(), |_| 1.0);
         assert!((radiance.diffuse[1] - 1.0).abs() < 1e-6);
         assert_eq!(radiance.specular, [0.0; 3]);

@@ -42,12 +42,18 @@ struct Place {
 impl Organs {
     /// Grow the organs of `seed`; `texel_mm` is the finest detail of the texture.
     pub fn new(anatomy: Anatomy, seed: u64, texel_mm: f64) -> Self {
-        let shape = Shape { anatomy, noise: Noise::new(seed ^ 0x5157) };
-        let relief =
-            Relief::from_function(HALF_WIDTH_MM, HALF_HEIGHT_MM, RELIEF_PITCH_MM, |x, y| shape.at(x, y).z);
+        let shape = Shape {
+            anatomy,
+            noise: Noise::new(seed ^ 0x5157),
+        };
+        let relief = Relief::from_function(HALF_WIDTH_MM, HALF_HEIGHT_MM, RELIEF_PITCH_MM, |x, y| shape.at(x, y).z);
         let grid = MaterialGrid::new(HALF_WIDTH_MM, HALF_HEIGHT_MM, texel_mm);
         let vessels = vessel_coverage(&grid, roots(anatomy), seed ^ 0x7E55);
-        let paint = Paint { shape, tissue: Noise::new(seed ^ 0x7155), film: Noise::new(seed ^ 0xF11F) };
+        let paint = Paint {
+            shape,
+            tissue: Noise::new(seed ^ 0x7155),
+            film: Noise::new(seed ^ 0xF11F),
+        };
         let film = paint.film_heights(&grid, &vessels);
         let material = MaterialMap::from_texels(HALF_WIDTH_MM, HALF_HEIGHT_MM, texel_mm, |grid, column, row| {
             let (x, y) = grid.place(column, row);
@@ -67,23 +73,98 @@ impl Organs {
 
 fn roots(anatomy: Anatomy) -> &'static [Root] {
     const GALL: &[Root] = &[
-        Root { at: [30.0, 20.0], heading: 3.5, radius_mm: 0.55, length_mm: 13.0 },
-        Root { at: [22.0, 7.0], heading: 3.3, radius_mm: 0.5, length_mm: 12.0 },
-        Root { at: [8.0, 14.0], heading: 3.9, radius_mm: 0.4, length_mm: 9.0 },
-        Root { at: [-8.0, -12.0], heading: 2.6, radius_mm: 0.35, length_mm: 8.0 },
-        Root { at: [-30.0, 4.0], heading: 5.2, radius_mm: 0.35, length_mm: 8.0 },
-        Root { at: [45.0, -40.0], heading: 2.4, radius_mm: 0.6, length_mm: 14.0 },
-        Root { at: [15.0, -48.0], heading: 1.2, radius_mm: 0.5, length_mm: 12.0 },
-        Root { at: [-60.0, 45.0], heading: 5.6, radius_mm: 0.5, length_mm: 15.0 },
-        Root { at: [10.0, 60.0], heading: 4.4, radius_mm: 0.5, length_mm: 15.0 },
-        Root { at: [-55.0, -45.0], heading: 0.7, radius_mm: 0.45, length_mm: 13.0 },
+        Root {
+            at: [30.0, 20.0],
+            heading: 3.5,
+            radius_mm: 0.55,
+            length_mm: 13.0,
+        },
+        Root {
+            at: [22.0, 7.0],
+            heading: 3.3,
+            radius_mm: 0.5,
+            length_mm: 12.0,
+        },
+        Root {
+            at: [8.0, 14.0],
+            heading: 3.9,
+            radius_mm: 0.4,
+            length_mm: 9.0,
+        },
+        Root {
+            at: [-8.0, -12.0],
+            heading: 2.6,
+            radius_mm: 0.35,
+            length_mm: 8.0,
+        },
+        Root {
+            at: [-30.0, 4.0],
+            heading: 5.2,
+            radius_mm: 0.35,
+            length_mm: 8.0,
+        },
+        Root {
+            at: [45.0, -40.0],
+            heading: 2.4,
+            radius_mm: 0.6,
+            length_mm: 14.0,
+        },
+        Root {
+            at: [15.0, -48.0],
+            heading: 1.2,
+            radius_mm: 0.5,
+            length_mm: 12.0,
+        },
+        Root {
+            at: [-60.0, 45.0],
+            heading: 5.6,
+            radius_mm: 0.5,
+            length_mm: 15.0,
+        },
+        Root {
+            at: [10.0, 60.0],
+            heading: 4.4,
+            radius_mm: 0.5,
+            length_mm: 15.0,
+        },
+        Root {
+            at: [-55.0, -45.0],
+            heading: 0.7,
+            radius_mm: 0.45,
+            length_mm: 13.0,
+        },
     ];
     const LIVER: &[Root] = &[
-        Root { at: [-60.0, 20.0], heading: 0.1, radius_mm: 0.6, length_mm: 16.0 },
-        Root { at: [50.0, -40.0], heading: 2.3, radius_mm: 0.55, length_mm: 15.0 },
-        Root { at: [10.0, 50.0], heading: 4.5, radius_mm: 0.5, length_mm: 14.0 },
-        Root { at: [-20.0, -50.0], heading: 1.4, radius_mm: 0.5, length_mm: 14.0 },
-        Root { at: [60.0, 25.0], heading: 3.3, radius_mm: 0.45, length_mm: 12.0 },
+        Root {
+            at: [-60.0, 20.0],
+            heading: 0.1,
+            radius_mm: 0.6,
+            length_mm: 16.0,
+        },
+        Root {
+            at: [50.0, -40.0],
+            heading: 2.3,
+            radius_mm: 0.55,
+            length_mm: 15.0,
+        },
+        Root {
+            at: [10.0, 50.0],
+            heading: 4.5,
+            radius_mm: 0.5,
+            length_mm: 14.0,
+        },
+        Root {
+            at: [-20.0, -50.0],
+            heading: 1.4,
+            radius_mm: 0.5,
+            length_mm: 14.0,
+        },
+        Root {
+            at: [60.0, 25.0],
+            heading: 3.3,
+            radius_mm: 0.45,
+            length_mm: 12.0,
+        },
     ];
     match anatomy {
         Anatomy::GallBladder => GALL,
@@ -110,14 +191,22 @@ impl Shape {
                 let bed = smooth_max(liver, fat, 1.6);
                 let (gall_z, presence) = self.gall_bladder(x, y);
                 let z = smooth_max(bed, gall_z, 1.2);
-                Place { z, gall: smooth_step((gall_z - bed + 0.25) / 1.1) * presence, fat: smooth_step((fat - liver) / 1.4 + 0.5) }
+                Place {
+                    z,
+                    gall: smooth_step((gall_z - bed + 0.25) / 1.1) * presence,
+                    fat: smooth_step((fat - liver) / 1.4 + 0.5),
+                }
             }
             Anatomy::Liver => {
                 // Two lobes with a fissure between them.
                 let along = x * 0.42 + y * 0.91 + 4.0 * self.noise.at(flat / 25.0) - 6.0;
                 let left = 4.0 - 0.010 * (along - 26.0) * (along - 26.0);
                 let right = 6.0 - 0.007 * (along + 30.0) * (along + 30.0);
-                Place { z: smooth_max(left, right, 1.5).max(-25.0) + swell, gall: 0.0, fat: 0.0 }
+                Place {
+                    z: smooth_max(left, right, 1.5).max(-25.0) + swell,
+                    gall: 0.0,
+                    fat: 0.0,
+                }
             }
         }
     }
@@ -165,13 +254,25 @@ impl Paint {
         colour = mixed(colour, LIVER_NET, 0.16 * lobules + 0.14 * speck);
 
         // Fat: yellow lobules, redder between them.
-        let fat = mixed(scaled(FAT, 1.0 + 0.18 * middle + 0.14 * fine), FAT_RED, (0.35 - 0.7 * coarse + 0.3 * middle).clamp(0.0, 0.8));
+        let fat = mixed(
+            scaled(FAT, 1.0 + 0.18 * middle + 0.14 * fine),
+            FAT_RED,
+            (0.35 - 0.7 * coarse + 0.3 * middle).clamp(0.0, 0.8),
+        );
         colour = mixed(colour, fat, place.fat);
 
         // Gall bladder: bile shimmers green and yellow through a pale, veined wall.
         let bile = smooth_step(0.5 + 0.9 * coarse + 0.012 * x);
-        let wall = mixed(mixed(GALL_PALE, GALL_GREEN, bile), GALL_PINK, (0.30 + 0.55 * middle + 0.2 * coarse).clamp(0.0, 0.85));
-        colour = mixed(colour, scaled(wall, 1.0 + 0.08 * middle + 0.13 * fine - 0.12 * speck), place.gall);
+        let wall = mixed(
+            mixed(GALL_PALE, GALL_GREEN, bile),
+            GALL_PINK,
+            (0.30 + 0.55 * middle + 0.2 * coarse).clamp(0.0, 0.85),
+        );
+        colour = mixed(
+            colour,
+            scaled(wall, 1.0 + 0.08 * middle + 0.13 * fine - 0.12 * speck),
+            place.gall,
+        );
 
         // Capillaries everywhere, faint; vessels over them.
         let net = (1.0 - self.tissue.octaves(p / 2.1 + Vector3::repeat(23.0), 2).abs() * 9.0).max(0.0);
@@ -180,7 +281,11 @@ impl Paint {
         colour = mixed(colour, VESSEL, depth * vessel);
 
         let wet = (0.9 + 0.5 * self.film.at(p / 14.0 + Vector3::repeat(3.0))).clamp(0.35, 1.3);
-        Texel { albedo: colour.map(|c| c.clamp(0.003, 0.9) as f32), gloss: wet as f32, film: [0.0; 2] }
+        Texel {
+            albedo: colour.map(|c| c.clamp(0.003, 0.9) as f32),
+            gloss: wet as f32,
+            film: [0.0; 2],
+        }
     }
 
     /// Height of the film above the tissue, mm.

@@ -10,10 +10,10 @@ use rayon::prelude::*;
 
 use crate::camera::intrinsics::Pixel;
 use crate::camera::model::CameraModel;
+use crate::geometry::point::Point;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
-use crate::geometry::point::Point;
 use crate::synthetic::airborne::{AIRLIGHT, Smoke, Streak, streaks};
 use crate::synthetic::instrument::{InstrumentHit, Rod, grasper, instrument_hit, unshaded};
 use crate::synthetic::light::{Facing, Lamp, Radiance, steel_radiance, tissue_radiance};
@@ -128,15 +128,27 @@ impl Renderer {
     /// `field_radius` is that of the image field in widths of the picture; `None` = the whole picture.
     pub fn new(world: World3d, camera: CameraModel, field_radius: Option<f64>, noise: f64) -> Self {
         let radius_px = field_radius.map(|share| share * camera.width as f64);
-        let lens_rays = Rays::new(&camera, |pixel| camera.unproject(pixel).map(|d| (d.coords.x, d.coords.y, pixel)), radius_px);
+        let lens_rays = Rays::new(
+            &camera,
+            |pixel| camera.unproject(pixel).map(|d| (d.coords.x, d.coords.y, pixel)),
+            radius_px,
+        );
         let pinhole = camera.pinhole();
         let seen_through_lens = |pixel: Pixel| {
             let ray = pinhole.unproject(pixel)?;
             let landing = camera.project(Point::from_coords(ray.coords))?;
-            camera.contains(landing, -0.5).then_some((ray.coords.x, ray.coords.y, landing))
+            camera
+                .contains(landing, -0.5)
+                .then_some((ray.coords.x, ray.coords.y, landing))
         };
         let pinhole_rays = Rays::new(&camera, seen_through_lens, radius_px);
-        Self { world, camera, sensor: Sensor::new(noise), lens_rays, pinhole_rays }
+        Self {
+            world,
+            camera,
+            sensor: Sensor::new(noise),
+            lens_rays,
+            pinhole_rays,
+        }
     }
 
     /// The world that is rendered.
@@ -224,7 +236,11 @@ impl Renderer {
             }
             truth
         });
-        Rendered { video, without_particles, truth }
+        Rendered {
+            video,
+            without_particles,
+            truth,
+        }
     }
 
     /// Light on the sensor, after exposure, through lens and smoke.
@@ -352,7 +368,14 @@ impl Renderer {
                 specular.pixels_mut()[i] = if excess > SPECULAR_LEVELS { 255 } else { 0 };
             }
         }
-        Truth { diffuse, strength, specular, instrument, particles: Mask::filled(width, height, 0), depth }
+        Truth {
+            diffuse,
+            strength,
+            specular,
+            instrument,
+            particles: Mask::filled(width, height, 0),
+            depth,
+        }
     }
 
     /// Depth of every ray, NaN where there is none.
@@ -360,17 +383,23 @@ impl Renderer {
         let (width, height) = (self.camera.width, self.camera.height);
         let node_columns = (width - 1).div_ceil(NODE_PX) + 1;
         let node_rows = (height - 1).div_ceil(NODE_PX) + 1;
-        let pixel_of = |column: usize, row: usize| {
-            (row * NODE_PX).min(height - 1) * width + (column * NODE_PX).min(width - 1)
-        };
+        let pixel_of = |column: usize, row: usize| (row * NODE_PX).min(height - 1) * width + (column * NODE_PX).min(width - 1);
         let nodes: Vec<f64> = (0..node_columns * node_rows)
-            .map(|n| view.first_depth(rays.slopes[pixel_of(n % node_columns, n / node_columns)]).unwrap_or(f64::NAN))
+            .map(|n| {
+                view.first_depth(rays.slopes[pixel_of(n % node_columns, n / node_columns)])
+                    .unwrap_or(f64::NAN)
+            })
             .collect();
         let mut depths = vec![f64::NAN; width * height];
         for row in 0..node_rows - 1 {
             for column in 0..node_columns - 1 {
                 let corner = row * node_columns + column;
-                let corners = [nodes[corner], nodes[corner + 1], nodes[corner + node_columns], nodes[corner + node_columns + 1]];
+                let corners = [
+                    nodes[corner],
+                    nodes[corner + 1],
+                    nodes[corner + node_columns],
+                    nodes[corner + node_columns + 1],
+                ];
                 let spread = corners.iter().fold(f64::MIN, |a, &b| a.max(b)) - corners.iter().fold(f64::MAX, |a, &b| a.min(b));
                 let smooth = corners.iter().all(|c| c.is_finite()) && spread < MAX_SPREAD_MM;
                 let (x0, y0) = (column * NODE_PX, row * NODE_PX);
@@ -382,14 +411,13 @@ impl Renderer {
                         }
                         let guess = smooth.then(|| {
                             let (u, v) = ((x - x0) as f64 / NODE_PX as f64, (y - y0) as f64 / NODE_PX as f64);
-                            (corners[0] * (1.0 - u) + corners[1] * u) * (1.0 - v)
-                                + (corners[2] * (1.0 - u) + corners[3] * u) * v
+                            (corners[0] * (1.0 - u) + corners[1] * u) * (1.0 - v) + (corners[2] * (1.0 - u) + corners[3] * u) * v
                         });
                         let near = guess.and_then(|guess| {
-                            view.polished_depth(rays.slopes[at], guess).filter(|d| (d - guess).abs() < MAX_POLISH_MM)
+                            view.polished_depth(rays.slopes[at], guess)
+                                .filter(|d| (d - guess).abs() < MAX_POLISH_MM)
                         });
-                        depths[at] =
-                            near.or_else(|| view.first_depth(rays.slopes[at])).unwrap_or(f64::NAN);
+                        depths[at] = near.or_else(|| view.first_depth(rays.slopes[at])).unwrap_or(f64::NAN);
                     }
                 }
             }
@@ -406,11 +434,17 @@ const MAX_POLISH_MM: f64 = 0.5;
 impl Rays {
     /// `ray_of` gives x, y at z = 1 and where the ray lands behind the lens.
     fn new(camera: &CameraModel, ray_of: impl Fn(Pixel) -> Option<(f64, f64, Pixel)> + Sync, radius_px: Option<f64>) -> Self {
-        let centre = Pixel { x: 0.5 * camera.width as f64 - 0.5, y: 0.5 * camera.height as f64 - 0.5 };
+        let centre = Pixel {
+            x: 0.5 * camera.width as f64 - 0.5,
+            y: 0.5 * camera.height as f64 - 0.5,
+        };
         let rays: Vec<([f64; 2], f32, [f32; 2])> = (0..camera.width * camera.height)
             .into_par_iter()
             .map(|i| {
-                let pixel = Pixel { x: (i % camera.width) as f64, y: (i / camera.width) as f64 };
+                let pixel = Pixel {
+                    x: (i % camera.width) as f64,
+                    y: (i / camera.width) as f64,
+                };
                 let Some((x, y, landing)) = ray_of(pixel) else {
                     return ([f64::NAN; 2], 0.0, [f32::NAN; 2]);
                 };
@@ -420,7 +454,11 @@ impl Rays {
                     (0.5 - beyond / 3.0).clamp(0.0, 1.0)
                 });
                 let landing = [landing.x as f32, landing.y as f32];
-                if share > 0.0 { ([x, y], share as f32, landing) } else { ([f64::NAN; 2], 0.0, [f32::NAN; 2]) }
+                if share > 0.0 {
+                    ([x, y], share as f32, landing)
+                } else {
+                    ([f64::NAN; 2], 0.0, [f32::NAN; 2])
+                }
             })
             .collect();
         Self {
@@ -440,7 +478,11 @@ impl<'a> View<'a> {
         let lamps = world
             .lamps
             .iter()
-            .map(|lamp| Lamp { at: eye + rotation * lamp.at, axis: rotation * lamp.axis, ..*lamp })
+            .map(|lamp| Lamp {
+                at: eye + rotation * lamp.at,
+                axis: rotation * lamp.axis,
+                ..*lamp
+            })
             .collect();
         Self {
             world,
@@ -450,7 +492,11 @@ impl<'a> View<'a> {
             rest_eye: rest.linear * eye + rest.offset,
             rest_linear: rest.linear,
             lamps,
-            rods: if with_instrument { grasper(seconds).to_vec() } else { Vec::new() },
+            rods: if with_instrument {
+                grasper(seconds).to_vec()
+            } else {
+                Vec::new()
+            },
         }
     }
 
@@ -463,9 +509,17 @@ impl<'a> View<'a> {
         if let Some(hit) = instrument_hit(&self.rods, self.eye, direction)
             && (depth.is_nan() || hit.t < depth)
         {
-            return Some(Seen { light: self.steel(direction, &hit), depth: hit.t, is_instrument: true });
+            return Some(Seen {
+                light: self.steel(direction, &hit),
+                depth: hit.t,
+                is_instrument: true,
+            });
         }
-        depth.is_finite().then(|| Seen { light: self.radiance(slope, depth), depth, is_instrument: false })
+        depth.is_finite().then(|| Seen {
+            light: self.radiance(slope, depth),
+            depth,
+            is_instrument: false,
+        })
     }
 
     fn steel(&self, direction: Vector3<f64>, hit: &InstrumentHit) -> Radiance {
@@ -477,14 +531,20 @@ impl<'a> View<'a> {
         };
         let light = steel_radiance(&facing, &self.lamps);
         let finish = hit.finish as f32;
-        Radiance { diffuse: light.diffuse.map(|v| v * finish), specular: light.specular.map(|v| v * finish) }
+        Radiance {
+            diffuse: light.diffuse.map(|v| v * finish),
+            specular: light.specular.map(|v| v * finish),
+        }
     }
 
     fn first_depth(&self, slope: [f64; 2]) -> Option<f64> {
         if slope[0].is_nan() {
             return None;
         }
-        self.world.organs.relief.first_hit(self.rest_eye, self.rest_rotation * Vector3::new(slope[0], slope[1], 1.0))
+        self.world
+            .organs
+            .relief
+            .first_hit(self.rest_eye, self.rest_rotation * Vector3::new(slope[0], slope[1], 1.0))
     }
 
     fn polished_depth(&self, slope: [f64; 2], guess: f64) -> Option<f64> {
@@ -500,9 +560,14 @@ impl<'a> View<'a> {
         let texel = self.world.organs.material.at(rest.x, rest.y);
         let film = texel.film.map(f64::from);
         // Normals go with the transposed of the map to rest.
-        let normal = self.rest_linear.tr_mul(&Vector3::new(-height.dx, -height.dy, 1.0)).normalize();
-        let film_normal =
-            self.rest_linear.tr_mul(&Vector3::new(-height.dx - film[0], -height.dy - film[1], 1.0)).normalize();
+        let normal = self
+            .rest_linear
+            .tr_mul(&Vector3::new(-height.dx, -height.dy, 1.0))
+            .normalize();
+        let film_normal = self
+            .rest_linear
+            .tr_mul(&Vector3::new(-height.dx - film[0], -height.dy - film[1], 1.0))
+            .normalize();
         let facing = Facing {
             at: self.eye + direction * depth,
             normal,
@@ -510,7 +575,11 @@ impl<'a> View<'a> {
             to_camera: -direction.normalize(),
         };
         tissue_radiance(&facing, &texel, &self.lamps, &self.world.film, |lamp| {
-            if self.rods.is_empty() { 1.0 } else { unshaded(&self.rods, facing.at, lamp.at) }
+            if self.rods.is_empty() {
+                1.0
+            } else {
+                unshaded(&self.rods, facing.at, lamp.at)
+            }
         })
     }
 }

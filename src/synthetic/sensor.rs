@@ -22,10 +22,19 @@ pub struct Sensor {
 impl Sensor {
     /// About one level of noise at mid-gray, times `noise`.
     pub fn new(noise: f64) -> Self {
-        let curve = (0..=CURVE_STEPS).map(|i| level_from_linear(i as f64 / CURVE_STEPS as f64) as f32).collect();
-        let normal = (0..4096).map(|i| normal_quantile((f64::from(i) + 0.5) / 4096.0) as f32).collect();
+        let curve = (0..=CURVE_STEPS)
+            .map(|i| level_from_linear(i as f64 / CURVE_STEPS as f64) as f32)
+            .collect();
+        let normal = (0..4096)
+            .map(|i| normal_quantile((f64::from(i) + 0.5) / 4096.0) as f32)
+            .collect();
         let variance = (noise * noise) as f32;
-        Self { curve, normal, read_variance: 1.2e-7 * variance, shot_variance: 6.5e-5 * variance }
+        Self {
+            curve,
+            normal,
+            read_variance: 1.2e-7 * variance,
+            shot_variance: 6.5e-5 * variance,
+        }
     }
 
     /// Level (0–255, not rounded) of linear light; clips.
@@ -52,7 +61,12 @@ impl Sensor {
 
 /// IEC 61966-2-1.
 fn level_from_linear(linear: f64) -> f64 {
-    255.0 * if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
+    255.0
+        * if linear <= 0.003_130_8 {
+            12.92 * linear
+        } else {
+            1.055 * linear.powf(1.0 / 2.4) - 0.055
+        }
 }
 
 /// Quantile of the normal distribution by bisection of its (Abramowitz and Stegun 7.1.26) integral; runs once a table entry.
@@ -83,7 +97,10 @@ pub struct AutoExposure {
 
 impl Default for AutoExposure {
     fn default() -> Self {
-        Self { target_level: 112.0, gain: 0.06 }
+        Self {
+            target_level: 112.0,
+            gain: 0.06,
+        }
     }
 }
 
@@ -91,7 +108,10 @@ impl AutoExposure {
     /// Exposure per frame, from each frame's metered light (linear, a few hundred samples a frame).
     pub fn exposures(&self, metered: &[Vec<f32>], sensor: &Sensor) -> Vec<f64> {
         let mean_level = |samples: &[f32], exposure: f64| {
-            let sum: f64 = samples.iter().map(|&light| f64::from(sensor.level(light * exposure as f32))).sum();
+            let sum: f64 = samples
+                .iter()
+                .map(|&light| f64::from(sensor.level(light * exposure as f32)))
+                .sum();
             sum / samples.len().max(1) as f64
         };
         let mut exposure = 1.0;

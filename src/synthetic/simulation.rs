@@ -184,8 +184,10 @@ fn planned(name: &'static str, course: Course, frames: usize, settings: &Setting
     let duration_s = frames as f64 / settings.frame_rate_hz;
     let trajectory = Trajectory::new(course, duration_s, renderer.world().world_from_organs);
     let times: Vec<f64> = (0..frames).map(|frame| frame as f64 / settings.frame_rate_hz).collect();
-    let metered: Vec<Vec<f32>> =
-        times.par_iter().map(|&t| renderer.metered(t, trajectory.world_from_camera(t))).collect();
+    let metered: Vec<Vec<f32>> = times
+        .par_iter()
+        .map(|&t| renderer.metered(t, trajectory.world_from_camera(t)))
+        .collect();
     let exposures = AutoExposure::default().exposures(&metered, renderer.sensor());
     // The survey's noise is not the live recording's.
     let seed = hash_u64(settings.seed ^ hash_u64(name.len() as u64));
@@ -243,8 +245,14 @@ fn write_recording(out: &Path, plan: &Plan, settings: &Settings, renderer: &Rend
     write_text(&folder.join("poses.tum"), &tum_text("T_base_hand, mm", read))?;
     let camera_name = "simulated_laparoscope";
     write_text(&folder.join("camera.yaml"), &camera_yaml(renderer.camera(), camera_name))?;
-    write_text(&truth.join("camera.yaml"), &camera_yaml(&renderer.camera().pinhole(), camera_name))?;
-    write_text(&folder.join("hand_eye.yaml"), &hand_eye_yaml(&hand_from_camera(settings.arm.scope_mm)))?;
+    write_text(
+        &truth.join("camera.yaml"),
+        &camera_yaml(&renderer.camera().pinhole(), camera_name),
+    )?;
+    write_text(
+        &folder.join("hand_eye.yaml"),
+        &hand_eye_yaml(&hand_from_camera(settings.arm.scope_mm)),
+    )?;
     let exact = plan.shots.iter().map(|shot| (shot.seconds, shot.world_from_camera));
     write_text(&truth.join("camera_poses.tum"), &tum_text("T_world_camera, mm", exact))?;
     let hand = plan.readings.iter().map(|r| (r.true_s, r.true_base_from_hand));
