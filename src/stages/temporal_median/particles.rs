@@ -10,7 +10,8 @@ use crate::image::buffer::{Image, Rgb8};
 use crate::stages::temporal_median::motion::{BLOCK, BlockStats, Motion};
 use crate::stages::temporal_median::noise::Noise;
 
-/// A particle's contrast in the median is at most this share of that in the newest frame; in still and in slow blocks.
+/// A particle's contrast in the median is at most this share of that in the newest frame; where the median speaks anyway,
+/// and where it speaks only for particles.
 const MAX_CONTRAST_STILL: f32 = 0.75;
 const MAX_CONTRAST_SLOW: f32 = 0.45;
 /// Particles that touch make a blob of up to this many times the extent of one; it must lose this much contrast, and all of
@@ -243,7 +244,7 @@ impl Particles {
             for x in blob.left / BLOCK..=blob.right / BLOCK {
                 let block = y * columns + x;
                 let still = evidence.motions[block] == Motion::Still;
-                if !still {
+                if !still || evidence.particles_only {
                     limit = MAX_CONTRAST_SLOW;
                 }
                 let suspect = self.suspect[block];
