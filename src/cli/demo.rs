@@ -129,9 +129,6 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let specular = process(&alone, context, extra).context("measuring")?;
     parts.measure_s = since(began);
     if specular.ended != Ended::Complete {
-        for fault in &specular.report.faults {
-            tracing::error!("{fault}");
-        }
         return Ok(specular.ended);
     }
 

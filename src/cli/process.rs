@@ -86,9 +86,6 @@ pub struct Processed {
 /// Run it, and say what came of it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let Processed { ended, report } = process(args, context, Vec::new())?;
-    for fault in &report.faults {
-        tracing::error!("{fault}");
-    }
     tracing::debug!("\n{}", report.timing_table());
     tracing::info!(
         "{} of {} frames written to {} in {:.1} s ({:.1} fps, {:.1} ms per frame end to end)",

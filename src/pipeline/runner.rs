@@ -10,6 +10,8 @@
 //! | the source fails | what came before is finished, then the failure is the outcome |
 //! | the line is asked to stop | no new frame enters, those under way are finished, sinks write their ends |
 //!
+//! Each of them is told by `tracing` once, when it happens, and stands in the [`Outcome`].
+//!
 //! The last stage's thread hands finished frames to the sinks' queues. Work that a stage spreads over cores goes to rayon's
 //! global pool, which all stages share, so stages compete for cores as tasks and not as surplus threads.
 
