@@ -14,6 +14,7 @@ use endofield::compose::{self, Choice, Equipment};
 use endofield::config::Config;
 use endofield::image::pool::Pool;
 use endofield::recording::folder::{Recording, Video};
+use endofield::stages::color_normalization::settings::ReferenceSource;
 
 #[path = "support/scene.rs"]
 mod scene;
@@ -75,7 +76,10 @@ fn main() -> std::process::ExitCode {
 fn allocations() -> Vec<String> {
     let recording = Recording { camera: Some(scene::laparoscope(SIZE.0, SIZE.1)), ..Recording::plain(Video::File("none".into())) };
     let equipment = Equipment { recording: &recording, light_field: None, size: SIZE };
-    let mut line = compose::line(&Config::default(), &Choice::ALL, &equipment).expect("the default line stands");
+    let mut config = Config::default();
+    // There is no color.yaml; the stage shall work.
+    config.color.reference = ReferenceSource::Start;
+    let mut line = compose::line(&config, &Choice::ALL, &equipment).expect("the default line stands");
     let pictures: Vec<_> = (0..8).map(|number| scene::picture(SIZE.0, SIZE.1, number)).collect();
     let pool = Pool::new(4);
     let camera = Arc::new(scene::laparoscope(SIZE.0, SIZE.1));

@@ -7,6 +7,7 @@ use endofield::config::Config;
 use endofield::pipeline::builder::Pipeline;
 use endofield::pipeline::queue::Queue;
 use endofield::recording::folder::{Recording, Video};
+use endofield::stages::color_normalization::settings::ReferenceSource;
 use endofield::time::ManualClock;
 
 use crate::support::line::{Keeping, Seen, Wandering};
@@ -16,7 +17,10 @@ fn run_once() -> Seen {
     let (width, height) = (192, 128);
     let recording = Recording { camera: Some(laparoscope(width, height)), ..Recording::plain(Video::File("none".into())) };
     let equipment = Equipment { recording: &recording, light_field: None, size: (width, height) };
-    let line = compose::line(&Config::default(), &Choice::ALL, &equipment).unwrap();
+    let mut config = Config::default();
+    // There is no color.yaml; the stage shall work.
+    config.color.reference = ReferenceSource::Start;
+    let line = compose::line(&config, &Choice::ALL, &equipment).unwrap();
     assert!(line.stages.len() >= 3, "the line has its stages");
     let (sink, seen) = Keeping::new("sink");
     let mut builder = Pipeline::builder(Box::new(Wandering::new(width, height, 24)), Arc::new(ManualClock::default()));

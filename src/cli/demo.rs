@@ -129,9 +129,6 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let specular = process(&alone, context, extra).context("measuring")?;
     parts.measure_s = since(began);
     if specular.ended != Ended::Complete {
-        for fault in &specular.report.faults {
-            tracing::error!("{fault}");
-        }
         return Ok(specular.ended);
     }
 
@@ -186,7 +183,9 @@ fn make_room(folder: &Path, context: &Context) -> anyhow::Result<()> {
 /// One line per figure: its name, as it is, enhanced.
 fn rows(quality: &Summary) -> Vec<[String; 3]> {
     let (before, after) = (&quality.as_it_is, &quality.output);
-    let row = |name: &str, before: String, after: String| [name.to_owned(), before, after];
+    // A figure that nothing was there to measure for is no number.
+    let shown = |text: String| if text.contains("NaN") { "–".to_owned() } else { text };
+    let row = |name: &str, before: String, after: String| [name.to_owned(), shown(before), shown(after)];
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
     let none = || "–".to_owned();
     vec![

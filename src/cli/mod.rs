@@ -97,10 +97,7 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
         Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
         Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
-        Command::Simulate(mut args) => {
-            args.force = context.force;
-            simulate::run(args, &context.console).map(|()| Ended::Complete)
-        }
+        Command::Simulate(args) => simulate::run(args, context),
     }
 }
 
@@ -117,12 +114,8 @@ fn code_from(result: anyhow::Result<Ended>) -> ExitCode {
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
             console::print_error(&error);
-<<<<<<< HEAD
             let of_usage = error.downcast_ref::<UsageError>().is_some() || matches!(error.downcast_ref(), Some(ConfigError::Set { .. }));
             if of_usage { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
-=======
-            if error.downcast_ref::<UsageError>().is_some() { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
->>>>>>> main
         }
     }
 }

@@ -138,7 +138,7 @@ impl SourceWorker {
             }
         }
         if let Some(message) = &failure {
-            tracing::debug!(message, "the source ended before its time");
+            tracing::error!("{message}");
         }
         Left::Source { working, failure, stopped, end_to_end: self.output.end_to_end() }
     }
@@ -306,10 +306,10 @@ impl SinkWorker {
             self.shared.stop.store(true, Ordering::Release);
         }
         let at_end = failure_of(|| self.sink.finish());
-        if let Some(first) = &outcome.failure {
-            tracing::error!(sink = outcome.name, frames = outcome.taken, "the sink ended before its time: {first}");
-        }
         outcome.failure = outcome.failure.or(at_end);
+        if let Some(failure) = &outcome.failure {
+            tracing::error!("{failure}");
+        }
         outcome.dropped = self.drops.get();
         Left::Sink { position: self.position, outcome }
     }
