@@ -97,10 +97,7 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
         Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
         Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
-        Command::Simulate(mut args) => {
-            args.force = context.force;
-            simulate::run(args, &context.console).map(|()| Ended::Complete)
-        }
+        Command::Simulate(args) => simulate::run(args, context),
     }
 }
 

@@ -2,12 +2,14 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context as _, bail};
+use anyhow::Context as _;
 
-use crate::progress::Progress;
-use crate::synthetic::arm::ArmSettings;
+use crate::cli::context::{Context, Ended};
+use crate::synthetic::arm::{ArmModel, ArmSettings};
+use crate::synthetic::arm_joints::JointErrors;
+use crate::synthetic::calibration_scene::simulate_boards;
 use crate::synthetic::organs::Anatomy;
-use crate::synthetic::simulation::{Settings, Subject, simulate};
+use crate::synthetic::simulation::{Settings, SimulationError, Storage, simulate};
 
 /// Make recordings of a simulated operation, with exact truth.
 #[derive(Debug, clap::Args)]
@@ -49,6 +51,12 @@ pub struct Args {
     /// Sensor noise; 1 = about one level.
     #[arg(long, default_value_t = 1.0)]
     noise: f64,
+    /// How the arm errs: white noise on its poses (poses.tum), or offsets, backlash and noise of its joints (joints.csv).
+    #[arg(long, value_enum, default_value_t = ArmKind::PoseNoise)]
+    arm: ArmKind,
+    /// How the pictures are stored: near-lossless H.264, or numbered PNGs.
+    #[arg(long, value_enum, default_value_t = VideoKind::Mp4)]
+    video: VideoKind,
     /// Standard deviation of the arm's position per axis, mm.
     #[arg(long, default_value_t = 0.25)]
     pose_noise_mm: f64,
@@ -64,9 +72,6 @@ pub struct Args {
     /// Fill the whole picture instead of a round field.
     #[arg(long)]
     full_frame: bool,
-    /// Write into a folder that is not empty: the program's own `--force`, which `main` fills in.
-    #[arg(skip)]
-    pub force: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -77,6 +82,22 @@ enum Scene {
     Liver,
     /// A checkerboard, 9x6 corners of 4 mm: waved before a still scope (survey), and still before a moving one (live).
     Calibration,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum ArmKind {
+    /// White noise on the poses.
+    PoseNoise,
+    /// An AESOP 3000 whose joints err.
+    Joints,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum VideoKind {
+    /// `video.mp4`.
+    Mp4,
+    /// `frames/%06d.png`.
+    Png,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -91,16 +112,12 @@ fn size_from_text(text: &str) -> Result<Size, String> {
 }
 
 /// Run it.
-pub fn run(args: Args, progress: &dyn Progress) -> anyhow::Result<()> {
-    let occupied = args.out.read_dir().is_ok_and(|mut entries| entries.next().is_some());
-    if occupied && !args.force {
-        bail!("{} is not empty; name another folder or add --force", args.out.display());
-    }
+pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
+    context.refuse_overwriting(&args.out)?;
     let settings = Settings {
-        subject: match args.scene {
-            Scene::Gall => Subject::Organs(Anatomy::GallBladder),
-            Scene::Liver => Subject::Organs(Anatomy::Liver),
-            Scene::Calibration => Subject::Board,
+        anatomy: match args.scene {
+            Scene::Gall => Anatomy::GallBladder,
+            Scene::Liver | Scene::Calibration => Anatomy::Liver,
         },
         seed: args.seed,
         width: args.size.width,
@@ -109,13 +126,22 @@ pub fn run(args: Args, progress: &dyn Progress) -> anyhow::Result<()> {
         live_frames: args.frames,
         arm: ArmSettings {
             late_s: args.pose_late_ms * 1e-3,
-            position_noise_mm: args.pose_noise_mm,
-            rotation_noise_rad: args.pose_noise_deg.to_radians(),
+            model: match args.arm {
+                ArmKind::PoseNoise => ArmModel::PoseNoise {
+                    position_mm: args.pose_noise_mm,
+                    rotation_rad: args.pose_noise_deg.to_radians(),
+                },
+                ArmKind::Joints => ArmModel::Joints(JointErrors::default()),
+            },
             scope_mm: args.scope_mm,
             ..ArmSettings::default()
         },
         breathing_mm: args.breathing_mm,
         heartbeat_mm: args.heartbeat_mm,
+        storage: match args.video {
+            VideoKind::Mp4 => Storage::Video,
+            VideoKind::Png => Storage::Pictures,
+        },
         noise: args.noise,
         instrument: args.instrument,
         particles_per_frame: args.particles,
@@ -123,13 +149,21 @@ pub fn run(args: Args, progress: &dyn Progress) -> anyhow::Result<()> {
         field_radius: (!args.full_frame).then_some(0.47),
         ..Settings::default()
     };
-    let summary = simulate(&args.out, &settings, progress)
-        .with_context(|| format!("simulating into {}", args.out.display()))?;
+    let made = if args.scene == Scene::Calibration {
+        simulate_boards(&args.out, &settings, &context.console)
+    } else {
+        simulate(&args.out, &settings, &context.console)
+    };
+    let summary = match made {
+        Ok(summary) => summary,
+        Err(SimulationError::Stopped) => return Ok(Ended::Interrupted),
+        Err(error) => return Err(error).with_context(|| format!("simulating into {}", args.out.display())),
+    };
     tracing::info!(
         frames = summary.frames,
         specular_percent = summary.specular_share * 100.0,
         mean_level = summary.mean_level,
         "simulated"
     );
-    Ok(())
+    Ok(Ended::Complete)
 }

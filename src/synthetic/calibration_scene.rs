@@ -9,19 +9,21 @@ use serde_json::json;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::progress::Progress;
-use crate::synthetic::arm::{arm_readings, hand_from_camera};
+use crate::synthetic::arm::arm_readings;
 use crate::synthetic::board::{Board, CORNERS, SQUARE_MM, corners, picture, station, waved};
-use crate::synthetic::export::{camera_yaml, hand_eye_yaml, make_folder, tum_text, write_rgb, write_text};
+use crate::synthetic::export::{make_folder, write_arm, write_camera, write_hand_eye, write_poses, write_rgb, write_text};
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::renderer::Renderer;
-use crate::synthetic::simulation::{POSE_MARGIN_S, Settings, SimulationError, Summary};
+use crate::synthetic::simulation::{POSE_MARGIN_S, Settings, SimulationError, Summary, renderer_of};
 use crate::synthetic::trajectory::{Course, Trajectory};
 
 /// A white sheet 75 mm away is then well exposed.
 const EXPOSURE: f64 = 0.9;
 
 /// Write both recordings and their truth into `out`.
-pub fn simulate_boards(out: &Path, settings: &Settings, renderer: &Renderer, progress: &dyn Progress) -> Result<Summary, SimulationError> {
+pub fn simulate_boards(out: &Path, settings: &Settings, progress: &dyn Progress) -> Result<Summary, SimulationError> {
+    settings.checked()?;
+    let renderer = &renderer_of(settings)?;
     let at_rest = Trajectory::new(Course::Still, 1.0, renderer.world().world_from_organs).world_from_camera(0.0);
     let world_from_board: Transform<World, Board> = at_rest * station(0.0).inverse();
     let still = move |_: f64| at_rest;
@@ -65,7 +67,7 @@ fn write_board_recording(
     make_folder(&truth)?;
     let seconds = |frame: usize| frame as f64 / settings.frame_rate_hz;
     let seed = hash_u64(settings.seed ^ hash_u64(name.len() as u64));
-    let readings = arm_readings(&settings.arm, seed, -POSE_MARGIN_S, seconds(frames) + POSE_MARGIN_S, world_from_camera);
+    let readings = arm_readings(&settings.arm, seed, -POSE_MARGIN_S, seconds(frames) + POSE_MARGIN_S, world_from_camera)?;
     let mut stamps = String::from("frame,timestamp_s\n");
     let mut found = String::from("frame,corner,x_px,y_px,board_x_mm,board_y_mm\n");
     for frame in 0..frames {
@@ -81,14 +83,14 @@ fn write_board_recording(
     }
     write_text(&folder.join("frames.csv"), &stamps)?;
     write_text(&truth.join("corners.csv"), &found)?;
-    write_text(&folder.join("poses.tum"), &tum_text("T_base_hand, mm", readings.iter().map(|r| (r.stamp_s, r.base_from_hand))))?;
+    write_arm(&folder, &readings)?;
     let exact = (0..frames).map(|frame| (seconds(frame), world_from_camera(seconds(frame))));
-    write_text(&truth.join("camera_poses.tum"), &tum_text("T_world_camera, mm", exact))?;
+    write_poses(&truth.join("camera_poses.tum"), "T_world_camera", exact)?;
     let boards = (0..frames).map(|frame| (seconds(frame), camera_from_board(seconds(frame))));
-    write_text(&truth.join("board_poses.tum"), &tum_text("T_camera_board, mm", boards))?;
+    write_poses(&truth.join("board_poses.tum"), "T_camera_board", boards)?;
     // Calibration is what these recordings are for: its results are the truth, not part of the recording.
-    write_text(&truth.join("camera.yaml"), &camera_yaml(renderer.camera(), "simulated_laparoscope"))?;
-    write_text(&truth.join("hand_eye.yaml"), &hand_eye_yaml(&hand_from_camera(settings.arm.scope_mm)))?;
+    write_camera(&truth.join("camera.yaml"), renderer.camera())?;
+    write_hand_eye(&truth.join("hand_eye.yaml"), settings.arm.scope_mm)?;
     progress.begin(&format!("rendering {name}"), frames as u64);
     let outcome = (0..frames).into_par_iter().try_for_each(|frame| {
         if progress.stopping() {

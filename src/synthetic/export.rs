@@ -1,17 +1,21 @@
 //! Recordings and truth on disk, in the layout of the project's formats.
 
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use image::ImageEncoder as _;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 
-use crate::camera::distortion::Distortion;
+use crate::camera::file as camera_file;
+use crate::camera::file::CameraFileError;
 use crate::camera::model::CameraModel;
-use crate::geometry::space::{Camera, Hand};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::media::error::MediaError;
+use crate::robot::hand_eye::{HandEye, HandEyeError};
+use crate::robot::trajectory::{TrajectoryError, write_tum};
+use crate::synthetic::arm::{ArmReading, hand_from_camera};
+use crate::time::Timestamp;
 
 /// Writing failed.
 #[derive(Debug, thiserror::Error)]
@@ -24,6 +28,18 @@ pub enum ExportError {
         /// Why not.
         source: std::io::Error,
     },
+    /// The video's encoder or container refused.
+    #[error(transparent)]
+    Video(#[from] MediaError),
+    /// A camera, hand-eye or pose file was not written.
+    #[error(transparent)]
+    Camera(#[from] CameraFileError),
+    /// A camera, hand-eye or pose file was not written.
+    #[error(transparent)]
+    HandEye(#[from] HandEyeError),
+    /// A camera, hand-eye or pose file was not written.
+    #[error(transparent)]
+    Poses(#[from] TrajectoryError),
     /// The encoder refused.
     #[error("cannot encode {path}: {source}")]
     Encode {
@@ -68,57 +84,59 @@ fn write_png(path: &Path, bytes: &[u8], size: (usize, usize), color: image::Exte
     fs::write(path, file).map_err(|source| ExportError::Io { path: path.to_owned(), source })
 }
 
-/// Lines of a TUM file: `stamp tx ty tz qx qy qz qw`.
-pub fn tum_text<To, From>(header: &str, poses: impl IntoIterator<Item = (f64, Transform<To, From>)>) -> String {
-    let mut text = format!("# {header}\n");
-    for (stamp, pose) in poses {
-        let (t, q) = (pose.translation(), pose.rotation());
-        // Writing to a String cannot fail.
-        let _infallible = writeln!(
-            text,
-            "{stamp:.6} {:.6} {:.6} {:.6} {:.9} {:.9} {:.9} {:.9}",
-            t.x, t.y, t.z, q.i, q.j, q.k, q.w
-        );
+/// Write poses, mm; `transform` as in `T_base_hand`.
+pub fn write_poses<To, From>(
+    path: &Path,
+    transform: &str,
+    poses: impl Iterator<Item = (f64, Transform<To, From>)>,
+) -> Result<(), ExportError> {
+    Ok(write_tum(path, transform, poses.map(|(s, pose)| (Timestamp::from_seconds(s), *pose.isometry())))?)
+}
+
+/// Write what the arm said: `joints.csv` where it is a chain of joints, else `poses.tum`.
+pub fn write_arm(folder: &Path, readings: &[ArmReading]) -> Result<(), ExportError> {
+    let joints = joints_text(readings, |reading| Some((reading.stamp_s, reading.joints.as_ref()?.read.as_slice())));
+    match joints {
+        Some(text) => write_text(&folder.join("joints.csv"), &text),
+        None => {
+            write_poses(&folder.join("poses.tum"), "T_base_hand", readings.iter().map(|r| (r.stamp_s, r.base_from_hand)))
+        }
     }
-    text
 }
 
-/// ROS `camera_info` YAML.
-pub fn camera_yaml(camera: &CameraModel, name: &str) -> String {
-    let k = &camera.intrinsics;
-    let (model, coefficients) = match &camera.distortion {
-        Distortion::None => ("plumb_bob", vec![0.0; 5]),
-        Distortion::BrownConrady { k, p } if k[3..] == [0.0; 3] => ("plumb_bob", vec![k[0], k[1], p[0], p[1], k[2]]),
-        Distortion::BrownConrady { k, p } => ("rational_polynomial", vec![k[0], k[1], p[0], p[1], k[2], k[3], k[4], k[5]]),
-        Distortion::KannalaBrandt { k } => ("equidistant", k.to_vec()),
-    };
-    let count = coefficients.len();
-    let listed: Vec<String> = coefficients.iter().map(|c| format!("{c:?}")).collect();
-    format!(
-        "image_width: {}\nimage_height: {}\ncamera_name: {name}\n\
-         camera_matrix:\n  rows: 3\n  cols: 3\n  data: [{:?}, 0.0, {:?}, 0.0, {:?}, {:?}, 0.0, 0.0, 1.0]\n\
-         distortion_model: {model}\ndistortion_coefficients:\n  rows: 1\n  cols: {count}\n  data: [{}]\n\
-         rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]\n\
-         projection_matrix:\n  rows: 3\n  cols: 4\n  data: [{:?}, 0.0, {:?}, 0.0, 0.0, {:?}, {:?}, 0.0, 0.0, 0.0, 1.0, 0.0]\n",
-        camera.width,
-        camera.height,
-        k.fx,
-        k.cx,
-        k.fy,
-        k.cy,
-        listed.join(", "),
-        k.fx,
-        k.cx,
-        k.fy,
-        k.cy
-    )
+/// Write where the hand was: `hand_poses.tum` and, where the arm is a chain of joints, `joints.csv`.
+pub fn write_true_arm(folder: &Path, readings: &[ArmReading]) -> Result<(), ExportError> {
+    let hands = readings.iter().map(|r| (r.true_s, r.true_base_from_hand));
+    write_poses(&folder.join("hand_poses.tum"), "T_base_hand", hands)?;
+    match joints_text(readings, |reading| Some((reading.true_s, reading.joints.as_ref()?.exact.as_slice()))) {
+        Some(text) => write_text(&folder.join("joints.csv"), &text),
+        None => Ok(()),
+    }
 }
 
-/// `hand_eye.yaml`.
-pub fn hand_eye_yaml(hand_from_camera: &Transform<Hand, Camera>) -> String {
-    let (t, q) = (hand_from_camera.translation(), hand_from_camera.rotation());
-    format!(
-        "# hand_from_camera, mm\nunit: mm\ntranslation: {{x: {:?}, y: {:?}, z: {:?}}}\nrotation: {{x: {:?}, y: {:?}, z: {:?}, w: {:?}}}\n",
-        t.x, t.y, t.z, q.i, q.j, q.k, q.w
-    )
+fn joints_text(readings: &[ArmReading], of: impl Fn(&ArmReading) -> Option<(f64, &[f64])>) -> Option<String> {
+    let count = of(readings.first()?)?.1.len();
+    let mut text = String::from("timestamp_s");
+    for number in 1..=count {
+        text.push_str(&format!(",q{number}"));
+    }
+    text.push('\n');
+    for (stamp, values) in readings.iter().filter_map(of) {
+        text.push_str(&format!("{stamp:.6}"));
+        for value in values {
+            text.push_str(&format!(",{value:.9}"));
+        }
+        text.push('\n');
+    }
+    Some(text)
+}
+
+/// Write `camera.yaml`.
+pub fn write_camera(path: &Path, camera: &CameraModel) -> Result<(), ExportError> {
+    Ok(camera_file::write(path, camera, "simulated_laparoscope")?)
+}
+
+/// Write `hand_eye.yaml`; it does not tell the time offset.
+pub fn write_hand_eye(path: &Path, scope_mm: f64) -> Result<(), ExportError> {
+    Ok(HandEye::new(hand_from_camera(scope_mm)).write(path)?)
 }

@@ -37,7 +37,7 @@ pub struct Film {
 
 impl Default for Film {
     fn default() -> Self {
-        Self { f0: 0.03, narrow_alpha: 0.055, wide_alpha: 0.22, wide_share: 0.35 }
+        Self { f0: 0.028, narrow_alpha: 0.05, wide_alpha: 0.20, wide_share: 0.18 }
     }
 }
 

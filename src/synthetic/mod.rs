@@ -2,6 +2,7 @@
 
 pub mod airborne;
 pub mod arm;
+pub mod arm_joints;
 pub mod board;
 pub mod calibration_scene;
 pub mod export;

@@ -22,6 +22,17 @@ pub struct Relief {
     lowest_mm: f64,
 }
 
+/// Where a ray meets the surface.
+#[derive(Clone, Copy, Debug)]
+pub struct ReliefHit {
+    /// Ray parameter.
+    pub t: f64,
+    /// Slope dz/dx of the surface there.
+    pub dx: f64,
+    /// Slope dz/dy of the surface there.
+    pub dy: f64,
+}
+
 /// The surface over one place.
 #[derive(Clone, Copy, Debug)]
 pub struct Height {
@@ -83,8 +94,10 @@ impl Relief {
         let (mut z, mut dx, mut dy) = (0.0, 0.0, 0.0);
         for k in 0..3 {
             let at = start + k * self.columns;
-            let row = &self.heights[at..at + 3];
-            let (a, b, c) = (f64::from(row[0]), f64::from(row[1]), f64::from(row[2]));
+            let Some(&[a, b, c]) = self.heights[at..].first_chunk::<3>() else {
+                break;
+            };
+            let (a, b, c) = (f64::from(a), f64::from(b), f64::from(c));
             let along = a * wu[0] + b * wu[1] + c * wu[2];
             z += wv[k] * along;
             dy += dv[k] * along;
@@ -94,7 +107,7 @@ impl Relief {
     }
 
     /// Where the ray `origin + t·direction` first meets the surface from above; t in units of `direction`.
-    pub fn first_hit(&self, origin: Vector3<f64>, direction: Vector3<f64>) -> Option<f64> {
+    pub fn first_hit(&self, origin: Vector3<f64>, direction: Vector3<f64>) -> Option<ReliefHit> {
         if direction.z > -1e-6 {
             return None;
         }
@@ -103,20 +116,24 @@ impl Relief {
         let mut t = ((self.highest_mm - origin.z) / direction.z).max(0.0);
         for _ in 0..400 {
             let p = origin + direction * t;
-            let gap = p.z - self.height(p.x, p.y).z;
-            if gap < 1e-3 {
-                return self.polished_hit(origin, direction, t).or(Some(t));
+            let height = self.height(p.x, p.y);
+            let gap = p.z - height.z;
+            if gap < 2e-3 {
+                let grazing = ReliefHit { t, dx: height.dx, dy: height.dy };
+                return self.polished_hit(origin, direction, t).or(Some(grazing));
             }
             t += gap / closing_speed;
             if t > last {
                 return None;
             }
         }
-        Some(t)
+        None
     }
 
     /// Newton's method from the guess `t`; `None` if it does not settle or the ray would leave the surface there.
-    pub fn polished_hit(&self, origin: Vector3<f64>, direction: Vector3<f64>, t: f64) -> Option<f64> {
+    pub fn polished_hit(&self, origin: Vector3<f64>, direction: Vector3<f64>, t: f64) -> Option<ReliefHit> {
+        /// A step this short leaves an error of its square times half the curvature, 1e-6 mm.
+        const SETTLED_MM: f64 = 1e-3;
         let mut t = t;
         for _ in 0..6 {
             let p = origin + direction * t;
@@ -127,16 +144,11 @@ impl Relief {
             }
             let step = (p.z - height.z) / closing_speed;
             t += step;
-            if step.abs() < 2e-6 {
-                return Some(t);
+            if step.abs() < SETTLED_MM {
+                return Some(ReliefHit { t, dx: height.dx, dy: height.dy });
             }
         }
         None
-    }
-
-    /// Highest control value, mm.
-    pub fn highest_mm(&self) -> f64 {
-        self.highest_mm
     }
 }
 
@@ -156,7 +168,7 @@ mod tests {
     fn a_tilted_plane_is_exact() {
         let relief = Relief::from_function(40.0, 30.0, 0.5, |x, y| 0.25 * x - 0.125 * y + 3.0);
         let (origin, direction) = (Vector3::new(1.0, 2.0, 80.0), Vector3::new(0.2, -0.1, -1.0));
-        let t = relief.first_hit(origin, direction).unwrap();
+        let t = relief.first_hit(origin, direction).unwrap().t;
         // z = 0.25 x − 0.125 y + 3 met analytically.
         let expected = (80.0 - 0.25 * 1.0 + 0.125 * 2.0 - 3.0) / (1.0 + 0.25 * 0.2 + 0.125 * 0.1);
         assert!((t - expected).abs() < 1e-4, "{t} {expected}");
@@ -168,7 +180,7 @@ mod tests {
         for k in 0..200 {
             let origin = Vector3::new(-30.0 + f64::from(k) * 0.1, 0.0, 30.0);
             let direction = Vector3::new(0.9, 0.05, -1.0);
-            let t = relief.first_hit(origin, direction).unwrap();
+            let t = relief.first_hit(origin, direction).unwrap().t;
             let above = |t: f64| {
                 let p = origin + direction * t;
                 p.z - relief.height(p.x, p.y).z

@@ -18,6 +18,7 @@ use crate::synthetic::airborne::{AIRLIGHT, Smoke, Streak, streaks};
 use crate::synthetic::instrument::{InstrumentHit, Rod, grasper, instrument_hit, unshaded};
 use crate::synthetic::light::{Facing, Lamp, Radiance, steel_radiance, tissue_radiance};
 use crate::synthetic::noise::hash_u64;
+use crate::synthetic::relief::ReliefHit;
 use crate::synthetic::scene::World3d;
 use crate::synthetic::sensor::Sensor;
 
@@ -196,8 +197,8 @@ impl Renderer {
                     continue;
                 }
                 let slope = self.lens_rays.slopes[at];
-                if let Some(depth) = view.first_depth(slope) {
-                    let light = view.radiance(slope, depth);
+                if let Some(hit) = view.first_hit(slope) {
+                    let light = view.radiance(slope, &hit);
                     samples.push(luma(std::array::from_fn(|k| light.diffuse[k] + light.specular[k])));
                 }
             }
@@ -230,11 +231,11 @@ impl Renderer {
     /// Light on the sensor, after exposure, through lens and smoke.
     fn light(&self, view: &View, shot: &Shot) -> Vec<[f32; 3]> {
         let width = self.camera.width;
-        let depths = self.depths(view, &self.lens_rays);
+        let hits = self.hits(view, &self.lens_rays);
         let exposure = shot.exposure as f32;
-        let mut light = vec![[0.0_f32; 3]; depths.len()];
+        let mut light = vec![[0.0_f32; 3]; hits.len()];
         for (i, pixel) in light.iter_mut().enumerate() {
-            if let Some(seen) = view.seen(self.lens_rays.slopes[i], depths[i]) {
+            if let Some(seen) = view.seen(self.lens_rays.slopes[i], &hits[i]) {
                 let through = exposure * self.lens_rays.field[i];
                 *pixel = std::array::from_fn(|k| (seen.light.diffuse[k] + seen.light.specular[k]) * through);
             }
@@ -317,14 +318,14 @@ impl Renderer {
 
     fn truth(&self, view: &View, shot: &Shot) -> Truth {
         let (width, height) = (self.camera.width, self.camera.height);
-        let depths = self.depths(view, &self.pinhole_rays);
+        let hits = self.hits(view, &self.pinhole_rays);
         let exposure = shot.exposure as f32;
         let mut body = vec![[0.0_f32; 3]; width * height];
         let mut full = body.clone();
         let mut depth = Image::filled(width, height, 0_u16);
         let mut instrument = Mask::filled(width, height, 0);
         for i in 0..width * height {
-            let Some(seen) = view.seen(self.pinhole_rays.slopes[i], depths[i]) else {
+            let Some(seen) = view.seen(self.pinhole_rays.slopes[i], &hits[i]) else {
                 continue;
             };
             depth.pixels_mut()[i] = (seen.depth * 100.0).round().clamp(0.0, 65535.0) as u16;
@@ -355,48 +356,57 @@ impl Renderer {
         Truth { diffuse, strength, specular, instrument, particles: Mask::filled(width, height, 0), depth }
     }
 
-    /// Depth of every ray, NaN where there is none.
-    fn depths(&self, view: &View, rays: &Rays) -> Vec<f64> {
+    /// Where every ray meets the tissue; t is NaN where it does not.
+    fn hits(&self, view: &View, rays: &Rays) -> Vec<ReliefHit> {
         let (width, height) = (self.camera.width, self.camera.height);
         let node_columns = (width - 1).div_ceil(NODE_PX) + 1;
         let node_rows = (height - 1).div_ceil(NODE_PX) + 1;
         let pixel_of = |column: usize, row: usize| {
             (row * NODE_PX).min(height - 1) * width + (column * NODE_PX).min(width - 1)
         };
-        let nodes: Vec<f64> = (0..node_columns * node_rows)
-            .map(|n| view.first_depth(rays.slopes[pixel_of(n % node_columns, n / node_columns)]).unwrap_or(f64::NAN))
-            .collect();
-        let mut depths = vec![f64::NAN; width * height];
+        let mut hits = vec![MISS; width * height];
+        let mut nodes = Vec::with_capacity(node_columns * node_rows);
+        for row in 0..node_rows {
+            for column in 0..node_columns {
+                let at = pixel_of(column, row);
+                hits[at] = view.first_hit(rays.slopes[at]).unwrap_or(MISS);
+                nodes.push(hits[at].t);
+            }
+        }
         for row in 0..node_rows - 1 {
             for column in 0..node_columns - 1 {
                 let corner = row * node_columns + column;
                 let corners = [nodes[corner], nodes[corner + 1], nodes[corner + node_columns], nodes[corner + node_columns + 1]];
-                let spread = corners.iter().fold(f64::MIN, |a, &b| a.max(b)) - corners.iter().fold(f64::MAX, |a, &b| a.min(b));
-                let smooth = corners.iter().all(|c| c.is_finite()) && spread < MAX_SPREAD_MM;
+                let highest = corners.iter().fold(f64::MIN, |a, &b| a.max(b));
+                let lowest = corners.iter().fold(f64::MAX, |a, &b| a.min(b));
+                let smooth = corners.iter().all(|c| c.is_finite()) && highest - lowest < MAX_SPREAD_MM;
                 let (x0, y0) = (column * NODE_PX, row * NODE_PX);
-                for y in y0..(y0 + NODE_PX + 1).min(height) {
-                    for x in x0..(x0 + NODE_PX + 1).min(width) {
+                let (x1, y1) = ((x0 + NODE_PX).min(width - 1), (y0 + NODE_PX).min(height - 1));
+                for y in y0..=y1 {
+                    let v = (y - y0) as f64 / (y1 - y0).max(1) as f64;
+                    let left = corners[0] * (1.0 - v) + corners[2] * v;
+                    let right = corners[1] * (1.0 - v) + corners[3] * v;
+                    for x in x0..=x1 {
                         let at = y * width + x;
-                        if rays.slopes[at][0].is_nan() || depths[at].is_finite() {
+                        let slope = rays.slopes[at];
+                        if slope[0].is_nan() || hits[at].t.is_finite() {
                             continue;
                         }
-                        let guess = smooth.then(|| {
-                            let (u, v) = ((x - x0) as f64 / NODE_PX as f64, (y - y0) as f64 / NODE_PX as f64);
-                            (corners[0] * (1.0 - u) + corners[1] * u) * (1.0 - v)
-                                + (corners[2] * (1.0 - u) + corners[3] * u) * v
-                        });
-                        let near = guess.and_then(|guess| {
-                            view.polished_depth(rays.slopes[at], guess).filter(|d| (d - guess).abs() < MAX_POLISH_MM)
-                        });
-                        depths[at] =
-                            near.or_else(|| view.first_depth(rays.slopes[at])).unwrap_or(f64::NAN);
+                        let guess = left + (right - left) * ((x - x0) as f64 / (x1 - x0).max(1) as f64);
+                        let near = if smooth { view.polished_hit(slope, guess) } else { None };
+                        hits[at] = near
+                            .filter(|hit| (hit.t - guess).abs() < MAX_POLISH_MM)
+                            .or_else(|| view.first_hit(slope))
+                            .unwrap_or(MISS);
                     }
                 }
             }
         }
-        depths
+        hits
     }
 }
+
+const MISS: ReliefHit = ReliefHit { t: f64::NAN, dx: 0.0, dy: 0.0 };
 
 /// More than this between the corners of a block is an edge, or nearly one, mm.
 const MAX_SPREAD_MM: f64 = 2.0;
@@ -454,18 +464,19 @@ impl<'a> View<'a> {
         }
     }
 
-    /// What the ray meets first; `depth` is that of the tissue, NaN where there is none.
-    fn seen(&self, slope: [f64; 2], depth: f64) -> Option<Seen> {
+    /// What the ray meets first; `tissue` is where it meets the tissue, t NaN where it does not.
+    fn seen(&self, slope: [f64; 2], tissue: &ReliefHit) -> Option<Seen> {
         if slope[0].is_nan() {
             return None;
         }
         let direction = self.rotation * Vector3::new(slope[0], slope[1], 1.0);
-        if let Some(hit) = instrument_hit(&self.rods, self.eye, direction)
-            && (depth.is_nan() || hit.t < depth)
+        if !self.rods.is_empty()
+            && let Some(hit) = instrument_hit(&self.rods, self.eye, direction)
+            && (tissue.t.is_nan() || hit.t < tissue.t)
         {
             return Some(Seen { light: self.steel(direction, &hit), depth: hit.t, is_instrument: true });
         }
-        depth.is_finite().then(|| Seen { light: self.radiance(slope, depth), depth, is_instrument: false })
+        tissue.t.is_finite().then(|| Seen { light: self.radiance(slope, tissue), depth: tissue.t, is_instrument: false })
     }
 
     fn steel(&self, direction: Vector3<f64>, hit: &InstrumentHit) -> Radiance {
@@ -480,31 +491,30 @@ impl<'a> View<'a> {
         Radiance { diffuse: light.diffuse.map(|v| v * finish), specular: light.specular.map(|v| v * finish) }
     }
 
-    fn first_depth(&self, slope: [f64; 2]) -> Option<f64> {
+    fn first_hit(&self, slope: [f64; 2]) -> Option<ReliefHit> {
         if slope[0].is_nan() {
             return None;
         }
         self.world.organs.relief.first_hit(self.rest_eye, self.rest_rotation * Vector3::new(slope[0], slope[1], 1.0))
     }
 
-    fn polished_depth(&self, slope: [f64; 2], guess: f64) -> Option<f64> {
+    fn polished_hit(&self, slope: [f64; 2], guess: f64) -> Option<ReliefHit> {
         let direction = self.rest_rotation * Vector3::new(slope[0], slope[1], 1.0);
         self.world.organs.relief.polished_hit(self.rest_eye, direction, guess)
     }
 
-    fn radiance(&self, slope: [f64; 2], depth: f64) -> Radiance {
+    fn radiance(&self, slope: [f64; 2], hit: &ReliefHit) -> Radiance {
         let ray = Vector3::new(slope[0], slope[1], 1.0);
         let direction = self.rotation * ray;
-        let rest = self.rest_eye + self.rest_rotation * ray * depth;
-        let height = self.world.organs.relief.height(rest.x, rest.y);
+        let rest = self.rest_eye + self.rest_rotation * ray * hit.t;
         let texel = self.world.organs.material.at(rest.x, rest.y);
         let film = texel.film.map(f64::from);
         // Normals go with the transposed of the map to rest.
-        let normal = self.rest_linear.tr_mul(&Vector3::new(-height.dx, -height.dy, 1.0)).normalize();
+        let normal = self.rest_linear.tr_mul(&Vector3::new(-hit.dx, -hit.dy, 1.0)).normalize();
         let film_normal =
-            self.rest_linear.tr_mul(&Vector3::new(-height.dx - film[0], -height.dy - film[1], 1.0)).normalize();
+            self.rest_linear.tr_mul(&Vector3::new(-hit.dx - film[0], -hit.dy - film[1], 1.0)).normalize();
         let facing = Facing {
-            at: self.eye + direction * depth,
+            at: self.eye + direction * hit.t,
             normal,
             film_normal,
             to_camera: -direction.normalize(),

@@ -83,7 +83,7 @@ pub struct AutoExposure {
 
 impl Default for AutoExposure {
     fn default() -> Self {
-        Self { target_level: 112.0, gain: 0.06 }
+        Self { target_level: 106.0, gain: 0.06 }
     }
 }
 
@@ -133,8 +133,8 @@ mod tests {
         let metered: Vec<Vec<f32>> = (0..120).map(|i| vec![if i < 20 { 0.5 } else { 0.1 }; 50]).collect();
         let exposures = AutoExposure::default().exposures(&metered, &sensor);
         let last = sensor.level(0.1 * exposures[119] as f32);
-        assert!((last - 112.0).abs() < 2.0, "{last}");
+        assert!((last - 106.0).abs() < 2.0, "{last}");
         let first = sensor.level(0.5 * exposures[0] as f32);
-        assert!((first - 112.0).abs() < 1.0, "{first}");
+        assert!((first - 106.0).abs() < 1.0, "{first}");
     }
 }

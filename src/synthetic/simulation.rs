@@ -6,12 +6,14 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde_json::json;
 
+use crate::geometry::transform::Transform;
+use crate::media::writer::{Output, VideoWriter, WriterSettings};
 use crate::progress::Progress;
+use crate::robot::kinematics::ArmError;
 use crate::synthetic::airborne::Smoke;
-use crate::synthetic::arm::{ArmReading, ArmSettings, arm_readings, hand_from_camera};
-use crate::synthetic::calibration_scene::simulate_boards;
+use crate::synthetic::arm::{ArmModel, ArmReading, ArmSettings, arm_readings, world_from_camera_at_work};
 use crate::synthetic::export::{
-    ExportError, camera_yaml, hand_eye_yaml, make_folder, tum_text, write_mask, write_rgb, write_text, write_u16,
+    ExportError, make_folder, write_arm, write_camera, write_hand_eye, write_mask, write_poses, write_rgb, write_text, write_true_arm, write_u16,
 };
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::organs::Anatomy;
@@ -19,21 +21,22 @@ use crate::synthetic::renderer::{Obstacles, Rendered, Renderer, Shot};
 use crate::synthetic::scene::{World3d, laparoscope};
 use crate::synthetic::sensor::AutoExposure;
 use crate::synthetic::trajectory::{Course, Trajectory};
+use crate::time::Timestamp;
 
-/// What lies before the scope.
+/// How the pictures of a recording are stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Subject {
-    /// Organs.
-    Organs(Anatomy),
-    /// A checkerboard.
-    Board,
+pub enum Storage {
+    /// `video.mp4`, near-lossless.
+    Video,
+    /// `frames/%06d.png`.
+    Pictures,
 }
 
 /// What to simulate.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// What lies before the scope.
-    pub subject: Subject,
+    /// Which organs.
+    pub anatomy: Anatomy,
     /// Everything random follows from it.
     pub seed: u64,
     /// Columns of the pictures.
@@ -46,6 +49,8 @@ pub struct Settings {
     pub survey_frames: usize,
     /// Frames of the live recording; 0 = none.
     pub live_frames: usize,
+    /// How the pictures are stored.
+    pub storage: Storage,
     /// How the arm measures.
     pub arm: ArmSettings,
     /// Stroke of a breath, mm.
@@ -67,13 +72,14 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            subject: Subject::Organs(Anatomy::GallBladder),
+            anatomy: Anatomy::GallBladder,
             seed: 1,
             width: 960,
             height: 540,
             frame_rate_hz: 25.0,
             survey_frames: 72,
             live_frames: 100,
+            storage: Storage::Video,
             arm: ArmSettings::default(),
             breathing_mm: 0.0,
             heartbeat_mm: 0.0,
@@ -102,6 +108,9 @@ pub enum SimulationError {
     /// A file could not be written.
     #[error(transparent)]
     Export(#[from] ExportError),
+    /// The arm cannot do what it shall.
+    #[error("the simulated arm: {0}")]
+    Arm(#[from] ArmError),
     /// The user stopped it.
     #[error("stopped; what was written so far is kept")]
     Stopped,
@@ -122,7 +131,7 @@ pub struct Summary {
 pub(super) const POSE_MARGIN_S: f64 = 0.4;
 
 impl Settings {
-    fn checked(&self) -> Result<(), SimulationError> {
+    pub(super) fn checked(&self) -> Result<(), SimulationError> {
         let fault = |key, value: String, expected| Err(SimulationError::Setting { key, value, expected });
         if !(64..=8192).contains(&self.width) || !(48..=8192).contains(&self.height) {
             return fault("size", format!("{}x{}", self.width, self.height), "64x48 to 8192x8192");
@@ -147,30 +156,18 @@ struct Plan {
 /// Simulate an operation into `out`: `survey`, `live` and `truth`.
 pub fn simulate(out: &Path, settings: &Settings, progress: &dyn Progress) -> Result<Summary, SimulationError> {
     settings.checked()?;
-    let camera = laparoscope(settings.width, settings.height);
-    let anatomy = match settings.subject {
-        Subject::Organs(anatomy) => anatomy,
-        // The board hides them.
-        Subject::Board => Anatomy::Liver,
-    };
-    let mut world = World3d::new(anatomy, settings.seed, settings.width);
-    world.motion.breathing_mm = settings.breathing_mm;
-    world.motion.heartbeat_mm = settings.heartbeat_mm;
-    let renderer = Renderer::new(world, camera, settings.field_radius, settings.noise);
-    if settings.subject == Subject::Board {
-        return simulate_boards(out, settings, &renderer, progress);
-    }
+    let renderer = renderer_of(settings)?;
     let mut plans = Vec::new();
     if settings.survey_frames > 0 {
-        plans.push(planned("survey", Course::Survey, settings.survey_frames, settings, &renderer));
+        plans.push(planned("survey", Course::Survey, settings.survey_frames, settings, &renderer)?);
     }
     if settings.live_frames > 0 {
-        plans.push(planned("live", Course::Live, settings.live_frames, settings, &renderer));
+        plans.push(planned("live", Course::Live, settings.live_frames, settings, &renderer)?);
     }
     let mut summary = Summary::default();
     for plan in &plans {
         write_recording(out, plan, settings, &renderer)?;
-        render_recording(out, plan, &renderer, progress, &mut summary)?;
+        render_recording(out, plan, settings, &renderer, progress, &mut summary)?;
     }
     let frames = summary.frames.max(1) as f64;
     summary.specular_share /= frames;
@@ -180,7 +177,22 @@ pub fn simulate(out: &Path, settings: &Settings, progress: &dyn Progress) -> Res
     Ok(summary)
 }
 
-fn planned(name: &'static str, course: Course, frames: usize, settings: &Settings, renderer: &Renderer) -> Plan {
+/// The world and the camera of `settings`.
+pub(super) fn renderer_of(settings: &Settings) -> Result<Renderer, SimulationError> {
+    let camera = laparoscope(settings.width, settings.height);
+    let mut world = World3d::new(settings.anatomy, settings.seed, settings.width);
+    world.motion.breathing_mm = settings.breathing_mm;
+    world.motion.heartbeat_mm = settings.heartbeat_mm;
+    if matches!(settings.arm.model, ArmModel::Joints(_)) {
+        // The patient lies where the arm can reach.
+        let organs_from_camera = Trajectory::new(Course::Still, 1.0, Transform::identity()).world_from_camera(0.0);
+        let at_work = world_from_camera_at_work(settings.arm.scope_mm)?;
+        world.world_from_organs = at_work * Transform::from_isometry(*organs_from_camera.inverse().isometry());
+    }
+    Ok(Renderer::new(world, camera, settings.field_radius, settings.noise))
+}
+
+fn planned(name: &'static str, course: Course, frames: usize, settings: &Settings, renderer: &Renderer) -> Result<Plan, SimulationError> {
     let duration_s = frames as f64 / settings.frame_rate_hz;
     let trajectory = Trajectory::new(course, duration_s, renderer.world().world_from_organs);
     let times: Vec<f64> = (0..frames).map(|frame| frame as f64 / settings.frame_rate_hz).collect();
@@ -213,15 +225,15 @@ fn planned(name: &'static str, course: Course, frames: usize, settings: &Setting
         .collect();
     let readings = arm_readings(&settings.arm, seed, -POSE_MARGIN_S, duration_s + POSE_MARGIN_S, |t| {
         trajectory.world_from_camera(t)
-    });
-    Plan { name, shots, readings }
+    })?;
+    Ok(Plan { name, shots, readings })
 }
 
 /// Everything but the pictures.
 fn write_recording(out: &Path, plan: &Plan, settings: &Settings, renderer: &Renderer) -> Result<(), SimulationError> {
     let folder = out.join(plan.name);
     let truth = out.join("truth").join(plan.name);
-    make_folder(&folder.join("frames"))?;
+    make_folder(&folder)?;
     for kind in ["diffuse", "specular", "strength", "instrument", "depth"] {
         make_folder(&truth.join(kind))?;
     }
@@ -239,63 +251,91 @@ fn write_recording(out: &Path, plan: &Plan, settings: &Settings, renderer: &Rend
     }
     write_text(&folder.join("frames.csv"), &frames)?;
     write_text(&truth.join("exposure.csv"), &exposures)?;
-    let read = plan.readings.iter().map(|r| (r.stamp_s, r.base_from_hand));
-    write_text(&folder.join("poses.tum"), &tum_text("T_base_hand, mm", read))?;
-    let camera_name = "simulated_laparoscope";
-    write_text(&folder.join("camera.yaml"), &camera_yaml(renderer.camera(), camera_name))?;
-    write_text(&truth.join("camera.yaml"), &camera_yaml(&renderer.camera().pinhole(), camera_name))?;
-    write_text(&folder.join("hand_eye.yaml"), &hand_eye_yaml(&hand_from_camera(settings.arm.scope_mm)))?;
+    write_arm(&folder, &plan.readings)?;
+    write_true_arm(&truth, &plan.readings)?;
+    write_camera(&folder.join("camera.yaml"), renderer.camera())?;
+    write_camera(&truth.join("camera.yaml"), &renderer.camera().pinhole())?;
+    write_hand_eye(&folder.join("hand_eye.yaml"), settings.arm.scope_mm)?;
     let exact = plan.shots.iter().map(|shot| (shot.seconds, shot.world_from_camera));
-    write_text(&truth.join("camera_poses.tum"), &tum_text("T_world_camera, mm", exact))?;
-    let hand = plan.readings.iter().map(|r| (r.true_s, r.true_base_from_hand));
-    write_text(&truth.join("hand_poses.tum"), &tum_text("T_base_hand, mm", hand))?;
+    write_poses(&truth.join("camera_poses.tum"), "T_world_camera", exact)?;
     Ok(())
 }
+
+/// Frames rendered at a time, then written in order; the same whatever the number of threads.
+const BATCH: usize = 8;
 
 fn render_recording(
     out: &Path,
     plan: &Plan,
+    settings: &Settings,
     renderer: &Renderer,
     progress: &dyn Progress,
     summary: &mut Summary,
 ) -> Result<(), SimulationError> {
     progress.begin(&format!("rendering {}", plan.name), plan.shots.len() as u64);
-    let folder = out.join(plan.name).join("frames");
     let truth = out.join("truth").join(plan.name);
-    let shares: Vec<Result<[f64; 2], SimulationError>> = plan
-        .shots
-        .par_iter()
-        .map(|shot| {
-            if progress.stopping() {
-                return Err(SimulationError::Stopped);
-            }
-            let rendered = renderer.render(shot, true);
-            let name = format!("{:06}.png", shot.frame);
-            write_rgb(&folder.join(&name), &rendered.video)?;
-            if let Some((clean, mask)) = &rendered.without_particles {
-                write_rgb(&truth.join("clean").join(&name), clean)?;
-                write_mask(&truth.join("particles_video").join(&name), mask)?;
-            }
-            if let Some(exact) = &rendered.truth {
-                write_rgb(&truth.join("diffuse").join(&name), &exact.diffuse)?;
-                write_mask(&truth.join("specular").join(&name), &exact.specular)?;
-                write_mask(&truth.join("strength").join(&name), &exact.strength)?;
-                write_mask(&truth.join("instrument").join(&name), &exact.instrument)?;
-                if rendered.without_particles.is_some() {
-                    write_mask(&truth.join("particles").join(&name), &exact.particles)?;
-                }
-                write_u16(&truth.join("depth").join(&name), &exact.depth)?;
-            }
+    let mut video = video_writer(&out.join(plan.name), settings)?;
+    for batch in plan.shots.chunks(BATCH) {
+        let rendered: Vec<(Rendered, [f64; 2])> = batch
+            .par_iter()
+            .map(|shot| {
+                let rendered = renderer.render(shot, true);
+                write_truth(&truth, shot.frame, &rendered)?;
+                let figures = measured(&rendered);
+                Ok((Rendered { truth: None, without_particles: None, ..rendered }, figures))
+            })
+            .collect::<Result<_, ExportError>>()?;
+        for (shot, (rendered, [specular, level])) in batch.iter().zip(&rendered) {
+            video.write(&rendered.video, Timestamp::from_seconds(shot.seconds)).map_err(ExportError::from)?;
+            summary.specular_share += specular;
+            summary.mean_level += level;
+            summary.frames += 1;
             progress.advance(1);
-            Ok(measured(&rendered))
-        })
-        .collect();
+        }
+        if progress.stopping() {
+            video.finish().map_err(ExportError::from)?;
+            return Err(SimulationError::Stopped);
+        }
+    }
+    video.finish().map_err(ExportError::from)?;
     progress.end();
-    for share in shares {
-        let [specular, level] = share?;
-        summary.specular_share += specular;
-        summary.mean_level += level;
-        summary.frames += 1;
+    Ok(())
+}
+
+/// `video.mp4` or `frames/%06d.png` in `folder`; an existing one is replaced (whether it may be was asked before).
+pub(super) fn video_writer(folder: &Path, settings: &Settings) -> Result<VideoWriter, SimulationError> {
+    // Milliseconds: the rate of the pictures need not be a whole number.
+    let rate = ((settings.frame_rate_hz * 1000.0).round() as i32, 1000);
+    let encoding = WriterSettings {
+        // Noise of one level survives; the file stays a tenth of PNGs.
+        crf: 5,
+        ..WriterSettings::new(settings.width, settings.height, rate)
+    };
+    let output = match settings.storage {
+        Storage::Video => Output::File(folder.join("video.mp4")),
+        Storage::Pictures => {
+            make_folder(&folder.join("frames"))?;
+            Output::Images(folder.join("frames"))
+        }
+    };
+    Ok(VideoWriter::create(&output, &encoding, true).map_err(ExportError::from)?)
+}
+
+fn write_truth(folder: &Path, frame: u64, rendered: &Rendered) -> Result<(), ExportError> {
+    let name = format!("{frame:06}.png");
+    if let Some((clean, mask)) = &rendered.without_particles {
+        write_rgb(&folder.join("clean").join(&name), clean)?;
+        write_mask(&folder.join("particles_video").join(&name), mask)?;
+    }
+    if let Some(exact) = &rendered.truth {
+        write_rgb(&folder.join("diffuse").join(&name), &exact.diffuse)?;
+        write_mask(&folder.join("specular").join(&name), &exact.specular)?;
+        write_mask(&folder.join("strength").join(&name), &exact.strength)?;
+        write_mask(&folder.join("instrument").join(&name), &exact.instrument)?;
+        if rendered.without_particles.is_some() {
+            write_mask(&folder.join("particles").join(&name), &exact.particles)?;
+        }
+        write_u16(&folder.join("depth").join(&name), &exact.depth)?;
     }
     Ok(())
 }
@@ -331,16 +371,13 @@ fn truth_json(settings: &Settings, plans: &[Plan], summary: &Summary) -> String 
             "<recording>/depth/%06d.png": "16-bit, hundredths of a mm along the optical axis; 0 outside the field",
             "<recording>/camera_poses.tum": "T_world_camera at each frame's exposure",
             "<recording>/hand_poses.tum": "T_base_hand, exact, on the camera's clock",
+            "<recording>/joints.csv": "exact joint values (mm, rad) on the camera's clock, where the arm is a chain of joints",
             "<recording>/exposure.csv": "factor on the light",
             "<recording>/camera.yaml": "the pinhole camera of the truth",
             "field.png": "255 inside the image field, undistorted",
         },
         "time_offset_s": -settings.arm.late_s,
-        "arm": {
-            "rate_hz": settings.arm.rate_hz,
-            "position_noise_mm": settings.arm.position_noise_mm,
-            "rotation_noise_rad": settings.arm.rotation_noise_rad,
-        },
+        "arm": arm_json(&settings.arm),
         "motion": { "breathing_mm": settings.breathing_mm, "heartbeat_mm": settings.heartbeat_mm },
         "obstacles": {
             "instrument": settings.instrument,
@@ -351,4 +388,25 @@ fn truth_json(settings: &Settings, plans: &[Plan], summary: &Summary) -> String 
         "mean_level": summary.mean_level,
     });
     format!("{value:#}\n")
+}
+
+fn arm_json(arm: &ArmSettings) -> serde_json::Value {
+    match &arm.model {
+        ArmModel::PoseNoise { position_mm, rotation_rad } => json!({
+            "rate_hz": arm.rate_hz,
+            "position_noise_mm": position_mm,
+            "rotation_noise_rad": rotation_rad,
+        }),
+        ArmModel::Joints(errors) => json!({
+            "rate_hz": arm.rate_hz,
+            "joint_errors": {
+                "offset_mm": errors.offset_mm,
+                "offset_rad": errors.offset_rad,
+                "backlash_mm": errors.backlash_mm,
+                "backlash_rad": errors.backlash_rad,
+                "noise_mm": errors.noise_mm,
+                "noise_rad": errors.noise_rad,
+            },
+        }),
+    }
 }

@@ -42,7 +42,7 @@ struct Shaft {
 /// The trocar in the organs' space, mm.
 const TROCAR_MM: [f64; 3] = [8.0, -34.0, 158.0];
 /// What the shaft points at when not tilted.
-const FOCUS_MM: [f64; 3] = [0.0, 1.0, 3.0];
+const FOCUS_MM: [f64; 3] = [-2.0, 3.0, 4.0];
 /// Mean speed of the survey, mm/s.
 const SURVEY_MM_PER_S: f64 = 24.0;
 /// Length of one row of the survey's sweep and back, mm, at full tilt.
@@ -91,7 +91,7 @@ impl Trajectory {
             }
             Course::Live => Shaft {
                 tilt_x: 0.125 * (0.98 * seconds + 0.2).sin() + 0.02 * (2.3 * seconds).sin(),
-                tilt_y: 0.095 * (0.71 * seconds + 1.4).sin(),
+                tilt_y: 0.07 * (0.71 * seconds + 2.6).sin(),
                 distance_mm: 71.0 + 6.5 * (0.62 * seconds + 0.8).sin(),
                 roll: 0.035 * (0.5 * seconds).sin() + 0.02,
             },

@@ -23,7 +23,7 @@ pub struct Root {
 /// Below this a vessel is no longer seen, mm.
 const THINNEST_MM: f64 = 0.07;
 /// A branch is drawn in steps of this length, mm.
-const STEP_MM: f64 = 0.3;
+const STEP_MM: f64 = 0.15;
 
 /// How much of each texel of `grid` is vessel, 0–1.
 pub fn vessel_coverage(grid: &MaterialGrid, roots: &[Root], seed: u64) -> Vec<f32> {
@@ -35,12 +35,11 @@ pub fn vessel_coverage(grid: &MaterialGrid, roots: &[Root], seed: u64) -> Vec<f3
         let length = branch.length_mm * random.random_range(0.7..1.3);
         let mut gone = 0.0;
         while gone < length {
-            bend = 0.85 * bend + random.random_range(-0.09..0.09);
+            bend = 0.93 * bend + random.random_range(-0.009..0.009);
             heading += bend;
             at = [at[0] + STEP_MM * heading.cos(), at[1] + STEP_MM * heading.sin()];
             gone += STEP_MM;
-            // A little beading: vessels are not tubes of one width.
-            let radius = branch.radius_mm * (1.0 - 0.2 * gone / length) * random.random_range(0.93..1.07);
+            let radius = branch.radius_mm * (1.0 - 0.2 * gone / length);
             stamp(&mut coverage, grid, at, radius);
         }
         let share: f64 = random.random_range(0.35..0.65);
