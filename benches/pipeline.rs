@@ -106,8 +106,18 @@ fn light_field(renderer: &Renderer, camera: &Arc<CameraModel>) -> LightField {
         .into_iter()
         .filter_map(|(shot, _, truth)| {
             let truth = truth?;
-            let depth = truth.depth.pixels().iter().map(|hundredths| f32::from(*hundredths) * 0.01).collect();
-            let confidence = truth.depth.pixels().iter().map(|depth| if *depth > 0 { 255 } else { 0 }).collect();
+            let depth = truth
+                .depth
+                .pixels()
+                .iter()
+                .map(|hundredths| f32::from(*hundredths) * 0.01)
+                .collect();
+            let confidence = truth
+                .depth
+                .pixels()
+                .iter()
+                .map(|depth| if *depth > 0 { 255 } else { 0 })
+                .collect();
             Some(View {
                 frame_number: shot.frame as u32,
                 image: truth.diffuse,
@@ -121,7 +131,12 @@ fn light_field(renderer: &Renderer, camera: &Arc<CameraModel>) -> LightField {
         })
         .collect();
     let surface = views.get(VIEWS / 2).map(surface_of).unwrap_or_default();
-    LightField { views, surface, recipe: "bench".to_owned(), ..LightField::default() }
+    LightField {
+        views,
+        surface,
+        recipe: "bench".to_owned(),
+        ..LightField::default()
+    }
 }
 
 /// The surface that one view sees.
@@ -133,17 +148,26 @@ fn surface_of(view: &View) -> Mesh<World> {
         for column in 0..columns {
             let (x, y) = (column * MESH_STEP_PX, row * MESH_STEP_PX);
             let depth = f64::from(view.depth.at(x, y));
-            let ray = view.camera.unproject(Pixel { x: x as f64, y: y as f64 });
+            let ray = view.camera.unproject(Pixel {
+                x: x as f64,
+                y: y as f64,
+            });
             if let (true, Some(ray)) = (depth > 0.0, ray) {
                 index[row * columns + column] = Some(mesh.vertices.len() as u32);
-                mesh.vertices.push(view.world_from_camera * Point::<Camera>::from_coords(ray.coords * depth));
+                mesh.vertices
+                    .push(view.world_from_camera * Point::<Camera>::from_coords(ray.coords * depth));
             }
         }
     }
     for row in 1..rows {
         for column in 1..columns {
             let at = |r: usize, c: usize| index[r * columns + c];
-            let corners = [at(row - 1, column - 1), at(row - 1, column), at(row, column - 1), at(row, column)];
+            let corners = [
+                at(row - 1, column - 1),
+                at(row - 1, column),
+                at(row, column - 1),
+                at(row, column),
+            ];
             if let [Some(a), Some(b), Some(c), Some(d)] = corners {
                 mesh.triangles.extend([[a, c, b], [b, c, d]]);
             }
@@ -154,8 +178,16 @@ fn surface_of(view: &View) -> Mesh<World> {
 
 fn main() {
     // Cargo adds `--bench`.
-    let count: u64 = std::env::args().skip(1).find_map(|argument| argument.parse().ok()).unwrap_or(150);
-    let renderer = Renderer::new(World3d::new(Anatomy::GallBladder, 1, SIZE.0), laparoscope(SIZE.0, SIZE.1), Some(0.47), 1.0);
+    let count: u64 = std::env::args()
+        .skip(1)
+        .find_map(|argument| argument.parse().ok())
+        .unwrap_or(150);
+    let renderer = Renderer::new(
+        World3d::new(Anatomy::GallBladder, 1, SIZE.0),
+        laparoscope(SIZE.0, SIZE.1),
+        Some(0.47),
+        1.0,
+    );
     eprintln!("rendering {} pictures of {}x{} …", PICTURES + VIEWS, SIZE.0, SIZE.1);
     let live = rendered(&renderer, Course::Live, PICTURES, false);
     let light_field = light_field(&renderer, &Arc::new(renderer.camera().pinhole()));
@@ -174,26 +206,46 @@ fn main() {
     let mut config = Config::default();
     // Colors of the start are the reference: a simulated recording has no color.yaml, and the stage shall work.
     config.color.reference = endofield::stages::color_normalization::settings::ReferenceSource::Start;
-    let equipment = Equipment { recording: &recording, light_field: Some(Arc::new(light_field)), size: SIZE };
+    let equipment = Equipment {
+        recording: &recording,
+        light_field: Some(Arc::new(light_field)),
+        size: SIZE,
+    };
     let line = compose::line(&config, &Choice::ALL, &equipment).expect("the default line stands");
     for part in &line.left_out {
         eprintln!("left out: {part}");
     }
     let pictures = live.into_iter().map(|(_, picture, _)| picture).collect();
-    let source = ThereAndBack { pictures, pool: Pool::new(32), next: 0, count };
+    let source = ThereAndBack {
+        pictures,
+        pool: Pool::new(32),
+        next: 0,
+        count,
+    };
     let mut builder = Pipeline::builder(Box::new(source), Arc::new(MonotonicClock));
     for stage in line.stages {
         builder = builder.stage(stage);
     }
     let began = MonotonicClock.now();
-    let running = builder.sink(Box::new(Nowhere), Queue::blocking(2)).build().expect("the line stands").start().expect("threads");
+    let running = builder
+        .sink(Box::new(Nowhere), Queue::blocking(2))
+        .build()
+        .expect("the line stands")
+        .start()
+        .expect("threads");
     let outcome = running.wait_looking(|_| Wish::GoOn);
     let seconds = (MonotonicClock.now() - began).seconds();
 
     let row = |name: &str, times: &Summary| {
-        println!("{name:<26}{:>9.2}{:>9.2}{:>9.2}{:>9.2}", times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms);
+        println!(
+            "{name:<26}{:>9.2}{:>9.2}{:>9.2}{:>9.2}",
+            times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms
+        );
     };
-    println!("\n{:<26}{:>9}{:>9}{:>9}{:>9}", "ms per frame, 1920x1080", "p50", "p95", "p99", "max");
+    println!(
+        "\n{:<26}{:>9}{:>9}{:>9}{:>9}",
+        "ms per frame, 1920x1080", "p50", "p95", "p99", "max"
+    );
     row("source (a copy)", &outcome.source_working.summary());
     for stage in &outcome.stages {
         row(stage.name, &stage.working.summary());
@@ -202,7 +254,12 @@ fn main() {
         }
     }
     row("end to end (with waiting)", &outcome.end_to_end.summary());
-    println!("\n{} frames in {seconds:.1} s: {:.1} fps on {} threads", outcome.frames_out, outcome.frames_out as f64 / seconds, threads());
+    println!(
+        "\n{} frames in {seconds:.1} s: {:.1} fps on {} threads",
+        outcome.frames_out,
+        outcome.frames_out as f64 / seconds,
+        threads()
+    );
     println!("memory at its peak: {}", peak_memory());
     for fault in outcome.faults() {
         println!("fault: {fault}");
@@ -215,5 +272,8 @@ fn threads() -> usize {
 
 fn peak_memory() -> String {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    status.lines().find_map(|line| line.strip_prefix("VmHWM:")).map_or_else(|| "unknown".to_owned(), |value| value.trim().to_owned())
+    status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmHWM:"))
+        .map_or_else(|| "unknown".to_owned(), |value| value.trim().to_owned())
 }

@@ -111,7 +111,10 @@ pub enum ComposeError {
 impl fmt::Debug for Line {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let stages: Vec<_> = self.stages.iter().map(|stage| stage.name()).collect();
-        f.debug_struct("Line").field("stages", &stages).field("left_out", &self.left_out).finish_non_exhaustive()
+        f.debug_struct("Line")
+            .field("stages", &stages)
+            .field("left_out", &self.left_out)
+            .finish_non_exhaustive()
     }
 }
 
@@ -125,7 +128,11 @@ impl Line {
 pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Result<Line, ComposeError> {
     let recording = equipment.recording;
     let wants = |choice: Choice| wanted.contains(&choice);
-    let mut line = Line { stages: Vec::new(), left_out: Vec::new(), output_camera: None };
+    let mut line = Line {
+        stages: Vec::new(),
+        left_out: Vec::new(),
+        output_camera: None,
+    };
 
     if wants(Choice::Median) {
         line.stages.push(Box::new(TemporalMedian::new(&config.median)?));
@@ -175,7 +182,8 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
         if let Some(lacking) = lacking {
             line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
         }
-        line.stages.push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
+        line.stages
+            .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
         return Ok(());
     };
     match (&recording.trajectory, &recording.hand_eye) {
@@ -195,7 +203,13 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
             );
         }
     }
-    line.stages.push(Box::new(PoseRefinement::new(&config.pose_refinement, Arc::clone(light_field))));
-    line.stages.push(Box::new(SpecularitySubstitution::new(&config.substitution, Some(Arc::clone(light_field)))));
+    line.stages.push(Box::new(PoseRefinement::new(
+        &config.pose_refinement,
+        Arc::clone(light_field),
+    )));
+    line.stages.push(Box::new(SpecularitySubstitution::new(
+        &config.substitution,
+        Some(Arc::clone(light_field)),
+    )));
     Ok(())
 }

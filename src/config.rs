@@ -27,9 +27,10 @@ impl FromStr for Assignment {
 
     fn from_str(text: &str) -> Result<Self, String> {
         match text.split_once('=') {
-            Some((key, value)) if !key.trim().is_empty() => {
-                Ok(Self { key: key.trim().to_owned(), value: value.trim().to_owned() })
-            }
+            Some((key, value)) if !key.trim().is_empty() => Ok(Self {
+                key: key.trim().to_owned(),
+                value: value.trim().to_owned(),
+            }),
             _ => Err(format!("expected KEY=VALUE such as median.window_ms=200, found `{text}`")),
         }
     }
@@ -86,7 +87,10 @@ pub struct LineSettings {
 
 impl Default for LineSettings {
     fn default() -> Self {
-        Self { frames_between_stages: 2, frames_before_sinks: 4 }
+        Self {
+            frames_between_stages: 2,
+            frames_before_sinks: 4,
+        }
     }
 }
 
@@ -102,7 +106,10 @@ pub struct OutputSettings {
 
 impl Default for OutputSettings {
     fn default() -> Self {
-        Self { crf: 10, preset: "veryfast".to_owned() }
+        Self {
+            crf: 10,
+            preset: "veryfast".to_owned(),
+        }
     }
 }
 
@@ -137,7 +144,9 @@ impl Config {
     pub fn load(file: Option<&Path>, assignments: &[Assignment]) -> Result<Self, ConfigError> {
         let from_file = file.map(read_file).transpose()?.unwrap_or_default();
         let origin = file.map_or_else(|| "settings".to_owned(), |path| path.display().to_string());
-        from_file.check().map_err(|reason| ConfigError::OutOfBounds { origin, reason })?;
+        from_file
+            .check()
+            .map_err(|reason| ConfigError::OutOfBounds { origin, reason })?;
         let mut config = from_file;
         for assignment in assignments {
             config = config.with(assignment)?;
@@ -152,11 +161,17 @@ impl Config {
     }
 
     fn with(&self, assignment: &Assignment) -> Result<Self, ConfigError> {
-        let refused = |reason: String| ConfigError::Set { key: assignment.key.clone(), value: assignment.value.clone(), reason };
+        let refused = |reason: String| ConfigError::Set {
+            key: assignment.key.clone(),
+            value: assignment.value.clone(),
+            reason,
+        };
         let mut tree = Table::try_from(self).map_err(|error| refused(error.to_string()))?;
         let mut place = &mut tree;
         let mut path: Vec<&str> = assignment.key.split('.').collect();
-        let Some(last) = path.pop() else { return Err(refused("expected a key, found none".to_owned())) };
+        let Some(last) = path.pop() else {
+            return Err(refused("expected a key, found none".to_owned()));
+        };
         for part in path {
             let known = listed(place);
             place = match place.get_mut(part) {
@@ -170,7 +185,9 @@ impl Config {
         }
         let value = typed_value(&assignment.value, present).map_err(&refused)?;
         place.insert(last.to_owned(), value);
-        let changed: Self = Value::Table(tree).try_into().map_err(|error: toml::de::Error| refused(one_line(&error)))?;
+        let changed: Self = Value::Table(tree)
+            .try_into()
+            .map_err(|error: toml::de::Error| refused(one_line(&error)))?;
         changed.check().map_err(refused)?;
         Ok(changed)
     }
@@ -179,7 +196,8 @@ impl Config {
     fn check(&self) -> Result<(), String> {
         let within = |key: &str, value: usize, low: usize, high: usize| {
             let fits = (low..=high).contains(&value);
-            fits.then_some(()).ok_or_else(|| format!("{key}: expected {low} to {high}, found {value}"))
+            fits.then_some(())
+                .ok_or_else(|| format!("{key}: expected {low} to {high}, found {value}"))
         };
         within("line.frames_between_stages", self.line.frames_between_stages, 1, 64)?;
         within("line.frames_before_sinks", self.line.frames_before_sinks, 1, 256)?;
@@ -214,12 +232,19 @@ fn check_numbers(key: &str, value: &Value, lowest: f64) -> Result<(), String> {
 }
 
 fn read_file(path: &Path) -> Result<Config, ConfigError> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|error| ConfigError::Unreadable { path: path.to_owned(), reason: error.to_string() })?;
+    let text = std::fs::read_to_string(path).map_err(|error| ConfigError::Unreadable {
+        path: path.to_owned(),
+        reason: error.to_string(),
+    })?;
     toml::from_str(&text).map_err(|error| {
-        let line = error.span().map(|span| 1 + text.get(..span.start).unwrap_or("").matches('\n').count());
+        let line = error
+            .span()
+            .map(|span| 1 + text.get(..span.start).unwrap_or("").matches('\n').count());
         let place = line.map(|line| format!("line {line}: ")).unwrap_or_default();
-        ConfigError::File { path: path.to_owned(), reason: format!("{place}{}", one_line(&error)) }
+        ConfigError::File {
+            path: path.to_owned(),
+            reason: format!("{place}{}", one_line(&error)),
+        }
     })
 }
 
@@ -237,7 +262,9 @@ fn typed_value(text: &str, present: Option<&Value>) -> Result<Value, String> {
         let bare = text.strip_prefix('"').and_then(|rest| rest.strip_suffix('"')).unwrap_or(text);
         return Ok(Value::String(bare.to_owned()));
     }
-    let parsed = toml::from_str::<Table>(&format!("v = {text}")).ok().and_then(|mut table| table.remove("v"));
+    let parsed = toml::from_str::<Table>(&format!("v = {text}"))
+        .ok()
+        .and_then(|mut table| table.remove("v"));
     match (present, parsed) {
         (None, parsed) => Ok(parsed.unwrap_or_else(|| Value::String(text.to_owned()))),
         (Some(Value::Float(_)), Some(Value::Integer(whole))) => Ok(Value::Float(whole as f64)),

@@ -6,7 +6,11 @@ use std::process::{Command, Output};
 use endofield::image::buffer::Image;
 
 fn endofield(arguments: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_endofield")).args(arguments).current_dir(folder).output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_endofield"))
+        .args(arguments)
+        .current_dir(folder)
+        .output()
+        .unwrap()
 }
 
 fn stderr(output: &Output) -> String {
@@ -23,7 +27,14 @@ fn pictures(folder: &Path, count: usize) {
                 image.set(x, y, [170, 120, 90]);
             }
         }
-        image::save_buffer(folder.join(format!("{number:06}.png")), image.as_bytes(), 96, 64, image::ColorType::Rgb8).unwrap();
+        image::save_buffer(
+            folder.join(format!("{number:06}.png")),
+            image.as_bytes(),
+            96,
+            64,
+            image::ColorType::Rgb8,
+        )
+        .unwrap();
     }
 }
 
@@ -34,7 +45,10 @@ fn help_has_an_example_and_succeeds() {
         let output = endofield(&command, folder.path());
         let text = String::from_utf8_lossy(&output.stdout);
         assert_eq!(output.status.code(), Some(0), "{command:?}");
-        assert!(text.contains("endofield process") || text.contains("endofield demo"), "{command:?}: {text}");
+        assert!(
+            text.contains("endofield process") || text.contains("endofield demo"),
+            "{command:?}: {text}"
+        );
     }
     assert_eq!(endofield(&["--version"], folder.path()).status.code(), Some(0));
 }
@@ -72,7 +86,18 @@ fn the_settings_are_printed_without_an_input() {
 fn pictures_go_through_the_line_and_the_report_tells() {
     let folder = tempfile::tempdir().unwrap();
     pictures(&folder.path().join("in"), 7);
-    let arguments = ["process", "in", "-o", "out/", "--mask-out", "mask/", "--side-by-side", "both/", "--report", "report.json"];
+    let arguments = [
+        "process",
+        "in",
+        "-o",
+        "out/",
+        "--mask-out",
+        "mask/",
+        "--side-by-side",
+        "both/",
+        "--report",
+        "report.json",
+    ];
     let output = endofield(&arguments, folder.path());
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let count = |name: &str| std::fs::read_dir(folder.path().join(name)).unwrap().count();
@@ -82,7 +107,10 @@ fn pictures_go_through_the_line_and_the_report_tells() {
     assert_eq!(told.lines().filter(|line| line.contains("specular:")).count(), 1, "{told}");
     let text = std::fs::read_to_string(folder.path().join("report.json")).unwrap();
     let report: serde_json::Value = serde_json::from_str(&text).unwrap();
-    assert_eq!((report["frames"]["in"].as_u64(), report["frames"]["out"].as_u64()), (Some(7), Some(7)));
+    assert_eq!(
+        (report["frames"]["in"].as_u64(), report["frames"]["out"].as_u64()),
+        (Some(7), Some(7))
+    );
     assert_eq!(report["frames"]["dropped"].as_u64(), Some(0));
     assert_eq!(report["per_frame"].as_array().unwrap().len(), 7);
     assert_eq!(report["per_frame"][0]["pose"], "missing");
@@ -116,7 +144,11 @@ fn what_is_no_video_is_refused_with_a_message() {
     for input in ["empty.mp4", "text.mp4", "absent.mp4"] {
         let output = endofield(&["process", input, "-o", "out.mkv"], folder.path());
         assert_eq!(output.status.code(), Some(1), "{input}: {}", stderr(&output));
-        assert!(stderr(&output).starts_with("error: ") && stderr(&output).contains(input), "{}", stderr(&output));
+        assert!(
+            stderr(&output).starts_with("error: ") && stderr(&output).contains(input),
+            "{}",
+            stderr(&output)
+        );
         assert!(!stderr(&output).contains("panicked"));
     }
     assert!(!folder.path().join("out.mkv").exists());
@@ -126,8 +158,10 @@ fn what_is_no_video_is_refused_with_a_message() {
 fn progress_for_machines_is_json() {
     let folder = tempfile::tempdir().unwrap();
     pictures(&folder.path().join("in"), 3);
-    let output =
-        endofield(&["process", "in", "-o", "out/", "--progress", "json", "--log-format", "json"], folder.path());
+    let output = endofield(
+        &["process", "in", "-o", "out/", "--progress", "json", "--log-format", "json"],
+        folder.path(),
+    );
     assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
     let told = stderr(&output);
     for line in told.lines() {

@@ -45,7 +45,11 @@ fn every_default_is_explained() {
     for (number, line) in lines.iter().enumerate() {
         if line.contains(" = ") && !line.starts_with('#') {
             let above = number.checked_sub(1).map_or("", |n| lines[n]);
-            assert!(above.starts_with("# "), "config/default.toml:{}: `{line}` has no line above that says why", number + 1);
+            assert!(
+                above.starts_with("# "),
+                "config/default.toml:{}: `{line}` has no line above that says why",
+                number + 1
+            );
         }
     }
 }
@@ -56,13 +60,19 @@ fn a_setting_takes_the_kind_of_its_default() {
     assert_eq!(set("output.preset=fast").unwrap().output.preset, "fast");
     assert_eq!(set("output.preset=\"fast\"").unwrap().output.preset, "fast");
     let message = set("output.crf=fast").unwrap_err();
-    assert!(message.contains("output.crf=fast") && message.contains("whole number"), "{message}");
+    assert!(
+        message.contains("output.crf=fast") && message.contains("whole number"),
+        "{message}"
+    );
 }
 
 #[test]
 fn what_is_wrong_is_named() {
     let message = set("output.crf=99").unwrap_err();
-    assert!(message.contains("output.crf") && message.contains("99") && message.contains("0 to 51"), "{message}");
+    assert!(
+        message.contains("output.crf") && message.contains("99") && message.contains("0 to 51"),
+        "{message}"
+    );
     let message = set("output.crt=9").unwrap_err();
     assert!(message.contains("crt") && message.contains("crf"), "{message}");
     let message = set("outputs.crf=9").unwrap_err();
@@ -84,10 +94,18 @@ fn a_file_is_named_with_line_key_and_bound() {
     };
     assert_eq!(load("[output]\ncrf = 20\n").unwrap().output.crf, 20);
     let message = load("[output]\n\ncrt = 20\n").unwrap_err();
-    assert!(message.contains("my.toml") && message.contains("line 3") && message.contains("crt"), "{message}");
+    assert!(
+        message.contains("my.toml") && message.contains("line 3") && message.contains("crt"),
+        "{message}"
+    );
     let message = load("[output]\ncrf = 60\n").unwrap_err();
-    assert!(message.contains("my.toml") && message.contains("output.crf") && message.contains("60"), "{message}");
-    let message = Config::load(Some(&folder.path().join("none.toml")), &[]).unwrap_err().to_string();
+    assert!(
+        message.contains("my.toml") && message.contains("output.crf") && message.contains("60"),
+        "{message}"
+    );
+    let message = Config::load(Some(&folder.path().join("none.toml")), &[])
+        .unwrap_err()
+        .to_string();
     assert!(message.contains("none.toml"), "{message}");
 }
 
@@ -96,6 +114,9 @@ fn later_assignments_win_over_earlier_and_over_the_file() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("my.toml");
     fs::write(&path, "[output]\ncrf = 20\n").unwrap();
-    let sets: Vec<Assignment> = ["output.crf=21", "output.crf=22"].iter().map(|text| text.parse().unwrap()).collect();
+    let sets: Vec<Assignment> = ["output.crf=21", "output.crf=22"]
+        .iter()
+        .map(|text| text.parse().unwrap())
+        .collect();
     assert_eq!(Config::load(Some(&path), &sets).unwrap().output.crf, 22);
 }

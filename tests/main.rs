@@ -1,4 +1,10 @@
 //! The integration tests, one binary.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    reason = "a helper of a test may fail the test; clippy excuses only the test functions themselves"
+)]
 #![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
 
 mod architecture;
@@ -7,13 +13,19 @@ mod recording;
 mod robot;
 mod undistortion;
 mod media;
+#![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
+
 mod cli;
 mod color;
 mod config;
 mod determinism;
 mod light_field;
+mod media;
 mod pipeline;
+mod recording;
+mod robot;
 mod support;
-mod temporal_median;
 mod survey;
 mod synthetic;
+mod temporal_median;
+mod undistortion;

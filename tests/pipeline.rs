@@ -20,7 +20,10 @@ fn line(source: Numbered) -> Builder {
 #[test]
 fn frames_come_out_in_order_through_every_stage_once() {
     let (sink, seen) = Keeping::new("sink");
-    let built = line(Numbered::new(50)).stage(adding("one", 1)).stage(adding("two", 10)).sink(Box::new(sink), Queue::blocking(2));
+    let built = line(Numbered::new(50))
+        .stage(adding("one", 1))
+        .stage(adding("two", 10))
+        .sink(Box::new(sink), Queue::blocking(2));
     let outcome = built.build().unwrap().start().unwrap().wait();
     assert_eq!(seen.ids(), (0..50).collect::<Vec<_>>());
     assert_eq!(seen.levels(), (0..50).map(|n| n + 11).collect::<Vec<u8>>());
@@ -35,7 +38,13 @@ fn frames_come_out_in_order_through_every_stage_once() {
 #[test]
 fn a_line_without_stages_is_a_copy() {
     let (sink, seen) = Keeping::new("sink");
-    let outcome = line(Numbered::new(3)).sink(Box::new(sink), Queue::blocking(1)).build().unwrap().start().unwrap().wait();
+    let outcome = line(Numbered::new(3))
+        .sink(Box::new(sink), Queue::blocking(1))
+        .build()
+        .unwrap()
+        .start()
+        .unwrap()
+        .wait();
     assert_eq!((seen.ids(), outcome.frames_out), (vec![0, 1, 2], 3));
 }
 
@@ -43,7 +52,10 @@ fn a_line_without_stages_is_a_copy() {
 fn the_builder_refuses_a_line_that_cannot_run() {
     let keeping = |name| Box::new(Keeping::new(name).0);
     assert_eq!(line(Numbered::new(1)).build().unwrap_err(), BuildError::NoSink);
-    let twice = line(Numbered::new(1)).stage(adding("one", 1)).stage(adding("one", 1)).sink(keeping("sink"), Queue::blocking(1));
+    let twice = line(Numbered::new(1))
+        .stage(adding("one", 1))
+        .stage(adding("one", 1))
+        .sink(keeping("sink"), Queue::blocking(1));
     assert_eq!(twice.build().unwrap_err(), BuildError::SameName("one"));
     let no_room = line(Numbered::new(1)).sink(keeping("sink"), Queue::blocking(0));
     assert_eq!(no_room.build().unwrap_err(), BuildError::NoRoom("sink"));
@@ -63,13 +75,22 @@ fn an_error_lets_the_frame_go_on_as_it_came_and_resets_the_stage() {
     });
     let resets = Arc::clone(&failing.resets);
     let (sink, seen) = Keeping::new("sink");
-    let outcome =
-        line(Numbered::new(8)).stage(failing).sink(Box::new(sink), Queue::blocking(1)).build().unwrap().start().unwrap().wait();
+    let outcome = line(Numbered::new(8))
+        .stage(failing)
+        .sink(Box::new(sink), Queue::blocking(1))
+        .build()
+        .unwrap()
+        .start()
+        .unwrap()
+        .wait();
     assert_eq!(seen.levels(), [100, 101, 102, 3, 4, 5, 106, 107]);
     assert_eq!((outcome.stages[0].failures, outcome.stages[0].working.count()), (3, 5));
     assert_eq!(outcome.stages[0].first_failure.as_deref(), Some("too dark"));
     assert_eq!(resets.lock().unwrap().len(), 3);
-    assert!(outcome.faults().is_empty(), "single failed frames are what the line promises to live with");
+    assert!(
+        outcome.faults().is_empty(),
+        "single failed frames are what the line promises to live with"
+    );
 }
 
 #[test]
@@ -85,7 +106,10 @@ fn a_panic_bypasses_the_stage_for_good_and_is_reported() {
         Ok(())
     });
     let (sink, seen) = Keeping::new("sink");
-    let built = line(Numbered::new(6)).stage(panicking).stage(adding("after", 1)).sink(Box::new(sink), Queue::blocking(1));
+    let built = line(Numbered::new(6))
+        .stage(panicking)
+        .stage(adding("after", 1))
+        .sink(Box::new(sink), Queue::blocking(1));
     let outcome = built.build().unwrap().start().unwrap().wait();
     assert_eq!(seen.levels(), [201, 201, 3, 4, 5, 6]);
     assert_eq!(calls.load(Ordering::SeqCst), 3, "a stage that panicked is not called again");
@@ -142,7 +166,9 @@ fn a_sink_that_panics_is_a_failed_sink() {
         }
     }
     let (good, seen) = Keeping::new("good");
-    let built = line(Numbered::new(5)).sink(Box::new(Panicking), Queue::blocking(1)).sink(Box::new(good), Queue::blocking(1));
+    let built = line(Numbered::new(5))
+        .sink(Box::new(Panicking), Queue::blocking(1))
+        .sink(Box::new(good), Queue::blocking(1));
     let outcome = built.build().unwrap().start().unwrap().wait();
     assert_eq!(seen.ids().len(), 5);
     assert!(outcome.faults()[0].contains("a fault of ours"), "{:?}", outcome.faults());
@@ -152,7 +178,14 @@ fn a_sink_that_panics_is_a_failed_sink() {
 fn what_came_before_a_source_error_is_finished() {
     let (sink, seen) = Keeping::new("sink");
     let source = Numbered::new(7).then_error("the file ends in mid-frame");
-    let outcome = line(source).stage(adding("one", 1)).sink(Box::new(sink), Queue::blocking(1)).build().unwrap().start().unwrap().wait();
+    let outcome = line(source)
+        .stage(adding("one", 1))
+        .sink(Box::new(sink), Queue::blocking(1))
+        .build()
+        .unwrap()
+        .start()
+        .unwrap()
+        .wait();
     assert_eq!((seen.ids().len(), seen.finished()), (7, 1));
     assert_eq!(outcome.faults(), ["the file ends in mid-frame"]);
 }
@@ -184,8 +217,12 @@ fn a_stop_finishes_what_is_under_way() {
 fn whoever_waits_may_wish_for_the_end() {
     let (permit, permission) = bounded(0);
     let (sink, seen) = Keeping::new("sink");
-    let running =
-        line(Numbered::new(100).on_permission(permission)).sink(Box::new(sink), Queue::blocking(1)).build().unwrap().start().unwrap();
+    let running = line(Numbered::new(100).on_permission(permission))
+        .sink(Box::new(sink), Queue::blocking(1))
+        .build()
+        .unwrap()
+        .start()
+        .unwrap();
     permit.send(()).unwrap();
     let mut permit = Some(permit);
     let outcome = running.wait_looking(|status| {
@@ -292,7 +329,10 @@ fn switches_work_while_the_line_runs() {
     let (go, may_go) = bounded::<()>(1);
     let (sink, seen) = Keeping::new("sink");
     let running = line(Numbered::new(4).on_permission(permission))
-        .stage(Box::new(Scaled { strength: 1.0, resets: 0 }))
+        .stage(Box::new(Scaled {
+            strength: 1.0,
+            resets: 0,
+        }))
         .sink(Box::new(sink.gated(begun, may_go)), Queue::blocking(1))
         .build()
         .unwrap()
@@ -311,7 +351,11 @@ fn switches_work_while_the_line_runs() {
     one_frame(&|| controls.set_strength("scaled", 0.5).unwrap());
     drop(permit);
     let outcome = running.wait();
-    assert_eq!(seen.levels(), [100, 1, 101, 51], "as set, bypassed, taken in again after a reset, half");
+    assert_eq!(
+        seen.levels(),
+        [100, 1, 101, 51],
+        "as set, bypassed, taken in again after a reset, half"
+    );
     assert_eq!(outcome.stages[0].switched_off, 1);
 }
 
@@ -321,7 +365,9 @@ fn a_tap_sees_the_untouched_picture_and_the_original_is_kept_when_asked() {
     let (sink, seen) = Keeping::new("sink");
     let compares = Doing::boxed("compares", |frame: &mut Frame| {
         let original = frame.original.as_ref().ok_or_else(|| StageError("no original".to_owned()))?;
-        (original.at(0, 0)[0] + 1 == frame.image.at(0, 0)[0]).then_some(()).ok_or_else(|| StageError("not the original".to_owned()))
+        (original.at(0, 0)[0] + 1 == frame.image.at(0, 0)[0])
+            .then_some(())
+            .ok_or_else(|| StageError("not the original".to_owned()))
     });
     let built = line(Numbered::new(5))
         .keep_original(true)
@@ -345,7 +391,9 @@ fn times_are_those_of_the_clock() {
     });
     let (sink, _) = Keeping::new("sink");
     // One frame, so that no other thread's frame sees the clock turn.
-    let built = Pipeline::builder(Box::new(Numbered::new(1)), clock).stage(slow).sink(Box::new(sink), Queue::blocking(1));
+    let built = Pipeline::builder(Box::new(Numbered::new(1)), clock)
+        .stage(slow)
+        .sink(Box::new(sink), Queue::blocking(1));
     let outcome = built.build().unwrap().start().unwrap().wait();
     let working = outcome.stages[0].working.summary();
     assert!((working.p50_ms - 7.0).abs() < 0.01 && working.count == 1, "{working:?}");
@@ -369,7 +417,9 @@ fn a_long_gap_makes_stages_forget() {
         let resets = Arc::clone(&counting.resets);
         let (sink, _) = Keeping::new("sink");
         let source = Box::new(Jumping(Numbered::new(6), gap));
-        let built = Pipeline::builder(source, Arc::new(ManualClock::default())).stage(counting).sink(Box::new(sink), Queue::blocking(1));
+        let built = Pipeline::builder(source, Arc::new(ManualClock::default()))
+            .stage(counting)
+            .sink(Box::new(sink), Queue::blocking(1));
         built.build().unwrap().start().unwrap().wait();
         assert_eq!(resets.lock().unwrap().len(), resets_expected, "gap {gap}");
     }

@@ -17,8 +17,16 @@ fn every_wrong_file_is_named() {
     for (name, text, word) in [
         ("camera.yaml", "image_width: 10\n", "image_height"),
         ("camera.yaml", "{{{", "camera.yaml"),
-        ("hand_eye.yaml", "unit: mm\ntransformation: {x: 0, y: 0, z: 0, qx: 0, qy: 0, qz: 0, qw: 0}\n", "length 0"),
-        ("poses.tum", "# T_base_hand, mm\n1 0 0 0 0 0 0 1\n0.5 0 0 0 0 0 0 1\n", "line 3: time runs backwards"),
+        (
+            "hand_eye.yaml",
+            "unit: mm\ntransformation: {x: 0, y: 0, z: 0, qx: 0, qy: 0, qz: 0, qw: 0}\n",
+            "length 0",
+        ),
+        (
+            "poses.tum",
+            "# T_base_hand, mm\n1 0 0 0 0 0 0 1\n0.5 0 0 0 0 0 0 1\n",
+            "line 3: time runs backwards",
+        ),
         ("poses.tum", "# T_base_hand, mm\n1 nan 0 0 0 0 0 1\n", "line 2"),
         ("poses.tum", "", "found none"),
         ("joints.csv", "timestamp_s,q1\n0,1\n", "line 2"),
@@ -41,7 +49,11 @@ fn a_partial_recording_tells_what_it_lacks() {
     let folder = tempfile::tempdir().unwrap();
     put(folder.path(), "video.avi", "");
     put(folder.path(), "camera.yaml", CAMERA);
-    put(folder.path(), "joints.csv", "timestamp_s,q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0,0\n0.02,1,0,0,0,0,0,0\n");
+    put(
+        folder.path(),
+        "joints.csv",
+        "timestamp_s,q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0,0\n0.02,1,0,0,0,0,0,0\n",
+    );
     let recording = Recording::open(folder.path()).unwrap();
     let missing = recording.missing();
     assert_eq!(missing.iter().map(|m| m.what).collect::<Vec<_>>(), [Part::HandEye]);

@@ -8,7 +8,15 @@ use endofield::robot::trajectory::Trajectory;
 use endofield::time::Timestamp;
 
 fn joints_at(t: f64) -> [f64; 7] {
-    [150.0 + 10.0 * t, 0.3 + 0.05 * t, -0.6 - 0.08 * t, 0.1, 0.2 * (0.5 * t).sin(), -0.3, 0.1 * t]
+    [
+        150.0 + 10.0 * t,
+        0.3 + 0.05 * t,
+        -0.6 - 0.08 * t,
+        0.1,
+        0.2 * (0.5 * t).sin(),
+        -0.3,
+        0.1 * t,
+    ]
 }
 
 fn recorded() -> String {
@@ -36,7 +44,11 @@ fn joints_poses_and_exposure_agree() {
         let truth: Transform<RobotBase, Hand> = arm.base_from_hand(&joints_at(t)).unwrap();
         let error = |found: &Transform<RobotBase, Hand>| (found.translation() - truth.translation()).norm();
         // The stamps are rounded to 1 ns, the file to 1e-6 mm; the motion's third derivative leaves the rest.
-        assert!(error(&pose.base_from_hand) < 0.01, "{} mm at {t} s", error(&pose.base_from_hand));
+        assert!(
+            error(&pose.base_from_hand) < 0.01,
+            "{} mm at {t} s",
+            error(&pose.base_from_hand)
+        );
         let inverted = Transform::from_isometry(pose.base_from_hand.isometry().inverse());
         inverted_fits += usize::from(error(&inverted) < 0.01);
     }

@@ -81,10 +81,16 @@ fn depth_is_that_of_a_plain_ray_cast() {
             if depth == 0.0 {
                 continue;
             }
-            let pixel = endofield::camera::intrinsics::Pixel { x: x as f64, y: y as f64 };
+            let pixel = endofield::camera::intrinsics::Pixel {
+                x: x as f64,
+                y: y as f64,
+            };
             let ray = pinhole.unproject(pixel).unwrap();
             let expected = reference_depth(pose.translation(), (pose * ray).coords);
-            assert!((depth - expected).abs() < 0.0061, "pixel {x},{y}: {depth} mm, ray cast {expected} mm");
+            assert!(
+                (depth - expected).abs() < 0.0061,
+                "pixel {x},{y}: {depth} mm, ray cast {expected} mm"
+            );
             compared += 1;
         }
     }
@@ -114,15 +120,26 @@ fn a_known_point_of_the_surface_is_where_the_depth_map_says() {
             continue;
         }
         // Nothing is seen in front of the surface, and what is behind it is hidden by it.
-        assert!(seen.coords.z > nearest - 0.3, "{} mm before the surface at {nearest} mm", seen.coords.z);
-        if seen.coords.z <= farthest + 0.3 { visible += 1 } else { hidden += 1 }
+        assert!(
+            seen.coords.z > nearest - 0.3,
+            "{} mm before the surface at {nearest} mm",
+            seen.coords.z
+        );
+        if seen.coords.z <= farthest + 0.3 {
+            visible += 1
+        } else {
+            hidden += 1
+        }
     }
     assert!(visible > 200 && hidden < visible / 10, "{visible} visible, {hidden} hidden");
 }
 
 #[test]
 fn mirror_reflections_only_add_light() {
-    let pinhole = endofield::camera::model::CameraModel { distortion: Distortion::None, ..laparoscope(WIDTH, HEIGHT) };
+    let pinhole = endofield::camera::model::CameraModel {
+        distortion: Distortion::None,
+        ..laparoscope(WIDTH, HEIGHT)
+    };
     let renderer = Renderer::new(world().clone(), pinhole, None, 0.0);
     let rendered = renderer.render(&shot(2.0, Obstacles::default()), true);
     let truth = rendered.truth.unwrap();
@@ -133,8 +150,12 @@ fn mirror_reflections_only_add_light() {
     }
     // Without a lens, the video minus the diffuse picture is the strength.
     let luma = |p: &[u8; 3]| 0.299 * f64::from(p[0]) + 0.587 * f64::from(p[1]) + 0.114 * f64::from(p[2]);
-    for ((full, diffuse), &strength) in
-        rendered.video.pixels().iter().zip(truth.diffuse.pixels()).zip(truth.strength.pixels())
+    for ((full, diffuse), &strength) in rendered
+        .video
+        .pixels()
+        .iter()
+        .zip(truth.diffuse.pixels())
+        .zip(truth.strength.pixels())
     {
         assert!((luma(full) - luma(diffuse) - f64::from(strength)).abs() <= 1.6);
     }
@@ -143,7 +164,11 @@ fn mirror_reflections_only_add_light() {
 #[test]
 fn masks_agree_with_each_other() {
     let renderer = renderer(1.0);
-    let obstacles = Obstacles { instrument: true, particles_per_frame: 10.0, smoke: Some(Smoke::new(1, 1.0, 4.0)) };
+    let obstacles = Obstacles {
+        instrument: true,
+        particles_per_frame: 10.0,
+        smoke: Some(Smoke::new(1, 1.0, 4.0)),
+    };
     let rendered = renderer.render(&shot(1.6, obstacles), true);
     let truth = rendered.truth.unwrap();
     let field = renderer.field_mask();
@@ -188,7 +213,12 @@ fn what_breathes_moves_and_its_depth_stays_exact() {
     let rest = breathing.motion.rest_from_moved(2.0);
     let pinhole = renderer.camera().pinhole();
     for (x, y) in [(100, 60), (160, 90), (220, 120), (90, 130)] {
-        let ray = pinhole.unproject(endofield::camera::intrinsics::Pixel { x: f64::from(x), y: f64::from(y) }).unwrap();
+        let ray = pinhole
+            .unproject(endofield::camera::intrinsics::Pixel {
+                x: f64::from(x),
+                y: f64::from(y),
+            })
+            .unwrap();
         let depth = f64::from(within.depth.at(x as usize, y as usize)) / 100.0;
         let moved = (pose * Point::<Camera>::from_coords(ray.coords * depth)).coords;
         let p = rest.linear * moved + rest.offset;
@@ -197,7 +227,14 @@ fn what_breathes_moves_and_its_depth_stays_exact() {
 }
 
 fn small_operation(seed: u64) -> Settings {
-    Settings { seed, width: WIDTH, height: HEIGHT, survey_frames: 6, live_frames: 5, ..Settings::default() }
+    Settings {
+        seed,
+        width: WIDTH,
+        height: HEIGHT,
+        survey_frames: 6,
+        live_frames: 5,
+        ..Settings::default()
+    }
 }
 
 fn files_under(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
@@ -231,8 +268,16 @@ fn the_same_seed_gives_the_same_files_whatever_the_threads() {
         assert!(two[name] == *bytes, "{} differs", name.display());
     }
     assert!(one[Path::new("truth/live/diffuse/000001.png")] != other[Path::new("truth/live/diffuse/000001.png")]);
-    assert!((0.005..0.06).contains(&summary.specular_share), "specular share {}", summary.specular_share);
-    assert!((80.0..140.0).contains(&summary.mean_level), "mean level {}", summary.mean_level);
+    assert!(
+        (0.005..0.06).contains(&summary.specular_share),
+        "specular share {}",
+        summary.specular_share
+    );
+    assert!(
+        (80.0..140.0).contains(&summary.mean_level),
+        "mean level {}",
+        summary.mean_level
+    );
 }
 
 fn poses(path: &Path) -> Vec<(f64, Transform<World, Camera>)> {
@@ -288,14 +333,16 @@ fn the_survey_sees_the_field_from_many_sides_at_a_surgeons_pace() {
         let t = f64::from(i) / 25.0;
         length += (place(t + 0.04) - place(t)).norm();
         let towards = place(t) - focus;
-        angles.push((towards.x.atan2(towards.z).to_degrees(), towards.y.atan2(towards.z).to_degrees()));
+        angles.push((
+            towards.x.atan2(towards.z).to_degrees(),
+            towards.y.atan2(towards.z).to_degrees(),
+        ));
         distances.push(towards.norm());
     }
     let speed = length / duration_s;
     assert!((12.0..40.0).contains(&speed), "{speed} mm/s");
-    let span = |values: Vec<f64>| {
-        values.iter().copied().fold(f64::MIN, f64::max) - values.iter().copied().fold(f64::MAX, f64::min)
-    };
+    let span =
+        |values: Vec<f64>| values.iter().copied().fold(f64::MIN, f64::max) - values.iter().copied().fold(f64::MAX, f64::min);
     let across = span(angles.iter().map(|a| a.0).collect());
     let along = span(angles.iter().map(|a| a.1).collect());
     assert!(across > 18.0 && along > 12.0, "{across} × {along} degrees");

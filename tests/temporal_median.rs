@@ -195,8 +195,10 @@ fn particles_over_still_tissue_go() {
             &clip.seen,
         );
         let (worst, fair) = report(&format!("still, {method:?}"), &clip, &filtered);
+        // Only the first frame, before which there is nothing, is left as it came.
+        let (all, _) = restored(&clip, &filtered, |_, _| true);
         assert!(worst > -0.01);
-        assert!(fair >= 0.95);
+        assert!(fair >= 0.97 && all > 0.9, "{fair} {all}");
     }
 }
 
@@ -233,7 +235,7 @@ fn nothing_that_moves_gets_worse() {
             let clip = clip(14, 10 + index as u64, particles, scene);
             let filtered = run(&Settings::default(), &clip.seen);
             let (worst, _) = report(&format!("{name}, {particles} particles"), &clip, &filtered);
-            assert!(worst > -0.1, "{name}: a frame lost {worst:.2} dB");
+            assert!(worst > -0.07, "{name}: a frame lost {worst:.2} dB");
         }
     }
 }
@@ -259,7 +261,10 @@ fn an_instrument_leaves_no_ghost_and_particles_still_go_elsewhere() {
         let filtered = run(&Settings::default(), &clip.seen);
         let (worst, fair) = report(&format!("instrument {speed} px"), &clip, &filtered);
         assert!(worst > -0.05, "speed {speed}: a frame lost {worst:.2} dB");
-        assert!(fair > 0.85, "speed {speed}: only {fair:.3} of the particles went");
+        // Away from the instrument's track; beside it the guard rather leaves a particle than makes a ghost.
+        let (_, away) = restored(&clip, &filtered, |_, y| !(80..260).contains(&y));
+        eprintln!("instrument {speed} px: of the possible {fair:.4}, away from it {away:.4}");
+        assert!(away > 0.93, "speed {speed}: only {away:.3} of the particles went");
         // Ghost: pixels that the instrument covered lately or covers now, and no particle did.
         let (mut ghosts, mut counted) = (0, 0);
         for t in 5..filtered.len() {

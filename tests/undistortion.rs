@@ -11,7 +11,9 @@ use endofield::image::buffer::{Image, Rgb8};
 use endofield::image::remap::Interpolation;
 
 fn golden(name: &str) -> PathBuf {
-    [env!("CARGO_MANIFEST_DIR"), "fixtures/golden/undistortion", name].iter().collect()
+    [env!("CARGO_MANIFEST_DIR"), "fixtures/golden/undistortion", name]
+        .iter()
+        .collect()
 }
 
 fn picture(name: &str) -> Image<Rgb8> {
@@ -21,12 +23,39 @@ fn picture(name: &str) -> Image<Rgb8> {
 }
 
 fn cameras() -> Vec<(&'static str, CameraModel)> {
-    let intrinsics = Intrinsics { fx: 115.0, fy: 116.5, cx: 81.3, cy: 58.6 };
-    let with = |distortion| CameraModel { width: 160, height: 120, intrinsics, distortion };
+    let intrinsics = Intrinsics {
+        fx: 115.0,
+        fy: 116.5,
+        cx: 81.3,
+        cy: 58.6,
+    };
+    let with = |distortion| CameraModel {
+        width: 160,
+        height: 120,
+        intrinsics,
+        distortion,
+    };
     vec![
-        ("plumb_bob", with(Distortion::BrownConrady { k: [-0.31, 0.12, -0.018, 0.0, 0.0, 0.0], p: [0.0012, -0.0007] })),
-        ("rational_polynomial", with(Distortion::BrownConrady { k: [0.42, -0.11, 0.03, 0.71, -0.09, 0.02], p: [0.0008, 0.0004] })),
-        ("equidistant", with(Distortion::KannalaBrandt { k: [-0.021, 0.013, -0.006, 0.001] })),
+        (
+            "plumb_bob",
+            with(Distortion::BrownConrady {
+                k: [-0.31, 0.12, -0.018, 0.0, 0.0, 0.0],
+                p: [0.0012, -0.0007],
+            }),
+        ),
+        (
+            "rational_polynomial",
+            with(Distortion::BrownConrady {
+                k: [0.42, -0.11, 0.03, 0.71, -0.09, 0.02],
+                p: [0.0008, 0.0004],
+            }),
+        ),
+        (
+            "equidistant",
+            with(Distortion::KannalaBrandt {
+                k: [-0.021, 0.013, -0.006, 0.001],
+            }),
+        ),
     ]
 }
 
@@ -42,12 +71,17 @@ fn maps_agree_to_a_32nd_of_a_pixel() {
     for (name, camera) in cameras() {
         let table = undistortion::table(&camera, &camera.pinhole()).unwrap();
         let bytes = std::fs::read(golden(&format!("{name}_map.f32"))).unwrap();
-        let map: Vec<f32> = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+        let map: Vec<f32> = bytes
+            .chunks_exact(4)
+            .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+            .collect();
         let (mut compared, mut worst) = (0, 0.0_f64);
         for (i, pair) in map.chunks_exact(2).enumerate() {
             let (x, y) = (4 * (i % 40), 4 * (i / 40));
             let Some((sx, sy)) = table.position(x, y) else { continue };
-            worst = worst.max((sx - f64::from(pair[0])).abs()).max((sy - f64::from(pair[1])).abs());
+            worst = worst
+                .max((sx - f64::from(pair[0])).abs())
+                .max((sy - f64::from(pair[1])).abs());
             compared += 1;
         }
         assert!(worst <= 1.0 / 32.0, "{name}: {worst} px");

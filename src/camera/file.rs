@@ -283,8 +283,8 @@ fn distortion(tree: &Node) -> Result<Distortion, CameraFault> {
     let counted = |expected: &str| unexpected(expected, format!("{} for the model `{model}`", data.len()));
     match model {
         "plumb_bob" | "brown_conrady" | "radtan" => match data.as_slice() {
-            &[k1, k2, p1, p2] => Ok(brown(&[k1, k2, 0.0, 0.0, 0.0, 0.0], [p1, p2])),
-            &[k1, k2, p1, p2, k3] => Ok(brown(&[k1, k2, k3, 0.0, 0.0, 0.0], [p1, p2])),
+            [k1, k2, p1, p2] => Ok(brown(&[*k1, *k2, 0.0, 0.0, 0.0, 0.0], [*p1, *p2])),
+            [k1, k2, p1, p2, k3] => Ok(brown(&[*k1, *k2, *k3, 0.0, 0.0, 0.0], [*p1, *p2])),
             _ => Err(counted("4 or 5 numbers (k1 k2 p1 p2 k3)")),
         },
         "rational_polynomial" | "rational" => match data.as_slice() {

@@ -32,8 +32,16 @@ pub fn balanced_pinhole(camera: &CameraModel, balance: f64) -> Option<CameraMode
             let direction = camera.unproject(Pixel { x, y })?.coords;
             let (dx, dy) = (k.fx * direction.x, k.fy * direction.y);
             // Zooming by the ratio brings the ideal point to the border of the new picture.
-            let across = if x == 0.0 { Some(-k.cx / dx) } else { (x == right).then(|| (right - k.cx) / dx) };
-            let down = if y == 0.0 { Some(-k.cy / dy) } else { (y == bottom).then(|| (bottom - k.cy) / dy) };
+            let across = if x == 0.0 {
+                Some(-k.cx / dx)
+            } else {
+                (x == right).then(|| (right - k.cx) / dx)
+            };
+            let down = if y == 0.0 {
+                Some(-k.cy / dy)
+            } else {
+                (y == bottom).then(|| (bottom - k.cy) / dy)
+            };
             for ratio in [across, down].into_iter().flatten() {
                 if !(ratio.is_finite() && ratio > 0.0) {
                     return None;
@@ -44,8 +52,17 @@ pub fn balanced_pinhole(camera: &CameraModel, balance: f64) -> Option<CameraMode
         }
     }
     let zoom = filled * (1.0 - balance) + complete * balance;
-    let intrinsics = Intrinsics { fx: k.fx * zoom, fy: k.fy * zoom, ..*k };
-    Some(CameraModel { width: camera.width, height: camera.height, intrinsics, distortion: Distortion::None })
+    let intrinsics = Intrinsics {
+        fx: k.fx * zoom,
+        fy: k.fy * zoom,
+        ..*k
+    };
+    Some(CameraModel {
+        width: camera.width,
+        height: camera.height,
+        intrinsics,
+        distortion: Distortion::None,
+    })
 }
 
 #[cfg(test)]
@@ -53,21 +70,46 @@ mod tests {
     use super::*;
 
     fn camera(distortion: Distortion) -> CameraModel {
-        CameraModel { width: 320, height: 240, intrinsics: Intrinsics { fx: 250.0, fy: 252.0, cx: 158.0, cy: 121.5 }, distortion }
+        CameraModel {
+            width: 320,
+            height: 240,
+            intrinsics: Intrinsics {
+                fx: 250.0,
+                fy: 252.0,
+                cx: 158.0,
+                cy: 121.5,
+            },
+            distortion,
+        }
     }
 
     fn barrel() -> CameraModel {
-        camera(Distortion::BrownConrady { k: [-0.28, 0.05, 0.0, 0.0, 0.0, 0.0], p: [0.001, -0.0004] })
+        camera(Distortion::BrownConrady {
+            k: [-0.28, 0.05, 0.0, 0.0, 0.0, 0.0],
+            p: [0.001, -0.0004],
+        })
     }
 
     #[test]
     fn the_table_is_the_lens_to_half_a_step() {
-        for model in [barrel(), camera(Distortion::KannalaBrandt { k: [0.05, -0.01, 0.002, 0.0] })] {
+        for model in [
+            barrel(),
+            camera(Distortion::KannalaBrandt {
+                k: [0.05, -0.01, 0.002, 0.0],
+            }),
+        ] {
             let pinhole = model.pinhole();
             let table = table(&model, &pinhole).unwrap();
             for (x, y) in [(0, 0), (319, 239), (160, 120), (17, 203)] {
-                let direction = pinhole.unproject(Pixel { x: x as f64, y: y as f64 }).unwrap();
-                let truth = model.project(crate::geometry::point::Point::from_coords(direction.coords)).unwrap();
+                let direction = pinhole
+                    .unproject(Pixel {
+                        x: x as f64,
+                        y: y as f64,
+                    })
+                    .unwrap();
+                let truth = model
+                    .project(crate::geometry::point::Point::from_coords(direction.coords))
+                    .unwrap();
                 let (sx, sy) = table.position(x, y).unwrap();
                 assert!((sx - truth.x).abs() <= 1.0 / 64.0 + 1e-9 && (sy - truth.y).abs() <= 1.0 / 64.0 + 1e-9);
             }
@@ -81,12 +123,17 @@ mod tests {
         let table = table(&camera, &filled).unwrap();
         for (x, y) in [(0, 0), (319, 0), (0, 239), (319, 239), (0, 120), (160, 0)] {
             let (sx, sy) = table.position(x, y).unwrap();
-            assert!(sx > -0.5 && sy > -0.5 && sx < 319.5 && sy < 239.5, "({x}, {y}) comes from ({sx}, {sy})");
+            assert!(
+                sx > -0.5 && sy > -0.5 && sx < 319.5 && sy < 239.5,
+                "({x}, {y}) comes from ({sx}, {sy})"
+            );
         }
         let complete = balanced_pinhole(&camera, 1.0).unwrap();
         for (x, y) in [(0.0, 0.0), (319.0, 0.0), (0.0, 239.0), (319.0, 239.0)] {
             let direction = camera.unproject(Pixel { x, y }).unwrap();
-            let seen = complete.project(crate::geometry::point::Point::from_coords(direction.coords)).unwrap();
+            let seen = complete
+                .project(crate::geometry::point::Point::from_coords(direction.coords))
+                .unwrap();
             assert!(complete.contains(seen, -0.01), "({x}, {y}) is seen at {seen:?}");
         }
     }

@@ -86,7 +86,11 @@ impl Task {
 
     fn line(&self, now: Timestamp) -> String {
         let left = self.seconds_left(now).map(|s| format!(", {s:.0} s left")).unwrap_or_default();
-        let total = if self.total > 0 { format!("/{}", self.total) } else { String::new() };
+        let total = if self.total > 0 {
+            format!("/{}", self.total)
+        } else {
+            String::new()
+        };
         format!("{}: {}{total}, {:.1}/s{left}", self.name, self.done, self.per_second(now))
     }
 }
@@ -100,7 +104,12 @@ impl Console {
             ProgressMode::Json => Look::Json,
             ProgressMode::None => Look::Nothing,
         };
-        Self { look, bars: MultiProgress::new(), tasks: Mutex::new(Vec::new()), stop }
+        Self {
+            look,
+            bars: MultiProgress::new(),
+            tasks: Mutex::new(Vec::new()),
+            stop,
+        }
     }
 
     /// Send what `tracing` is told to stderr, around the bar.
@@ -117,9 +126,12 @@ impl Console {
         let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(writer);
         match globals.log_format {
             LogFormat::Json => log.json().flatten_event(true).try_init(),
-            LogFormat::Text => {
-                log.without_time().with_target(globals.verbose > 1).with_ansi(io::stderr().is_terminal()).compact().try_init()
-            }
+            LogFormat::Text => log
+                .without_time()
+                .with_target(globals.verbose > 1)
+                .with_ansi(io::stderr().is_terminal())
+                .compact()
+                .try_init(),
         }
         .map_err(|error| anyhow::anyhow!("expected to be the first to set up the log, found: {error}"))
     }
@@ -151,7 +163,14 @@ impl Progress for Console {
             bar.set_message(task.to_owned());
             bar
         });
-        let task = Task { name: task.to_owned(), total, done: 0, began: now, told: now, bar };
+        let task = Task {
+            name: task.to_owned(),
+            total,
+            done: 0,
+            began: now,
+            told: now,
+            bar,
+        };
         if self.look == Look::Json {
             self.say(&task.json("begin", now));
         }
@@ -173,7 +192,11 @@ impl Progress for Console {
             let now = MonotonicClock.now();
             if now - task.told >= every {
                 task.told = now;
-                self.say(&if self.look == Look::Json { task.json("progress", now) } else { task.line(now) });
+                self.say(&if self.look == Look::Json {
+                    task.json("progress", now)
+                } else {
+                    task.line(now)
+                });
             }
         });
     }
@@ -218,7 +241,10 @@ impl MakeWriter<'_> for AroundBars {
 
 /// Write a result to stdout.
 pub fn print(text: &str) -> anyhow::Result<()> {
-    io::stdout().lock().write_all(text.as_bytes()).context("expected to write to stdout")
+    io::stdout()
+        .lock()
+        .write_all(text.as_bytes())
+        .context("expected to write to stdout")
 }
 
 /// Tell an error and what is behind it, as one line.
@@ -247,14 +273,25 @@ mod tests {
     #[test]
     fn a_chain_is_told_once() {
         let inner = anyhow::anyhow!("no such file");
-        let outer = inner.context("cannot open video.mp4: no such file").context("reading the recording");
-        assert_eq!(chain_text(&outer), "reading the recording: cannot open video.mp4: no such file");
+        let outer = inner
+            .context("cannot open video.mp4: no such file")
+            .context("reading the recording");
+        assert_eq!(
+            chain_text(&outer),
+            "reading the recording: cannot open video.mp4: no such file"
+        );
     }
 
     #[test]
     fn a_task_tells_its_speed_and_time_left() {
-        let task =
-            Task { name: "process".into(), total: 100, done: 25, began: Timestamp(0), told: Timestamp(0), bar: None };
+        let task = Task {
+            name: "process".into(),
+            total: 100,
+            done: 25,
+            began: Timestamp(0),
+            told: Timestamp(0),
+            bar: None,
+        };
         let now = Timestamp::from_seconds(5.0);
         assert_eq!(task.line(now), "process: 25/100, 5.0/s, 15 s left");
         let json: serde_json::Value = serde_json::from_str(&task.json("progress", now)).unwrap();

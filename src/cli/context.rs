@@ -46,7 +46,10 @@ impl Globals {
 
     /// Only `--config` and `--set`, from a command line that lacks what its command needs.
     pub(super) fn only_configuration(arguments: &[OsString]) -> anyhow::Result<Self> {
-        let mut globals = Self { print_config: true, ..Self::default() };
+        let mut globals = Self {
+            print_config: true,
+            ..Self::default()
+        };
         let mut rest = arguments.iter().map(|argument| argument.to_string_lossy().into_owned());
         while let Some(argument) = rest.next() {
             let (name, inline) = match argument.split_once('=') {
@@ -56,7 +59,9 @@ impl Globals {
             if name != "--config" && name != "--set" {
                 continue;
             }
-            let value = inline.or_else(|| rest.next()).ok_or_else(|| UsageError(format!("expected a value after {name}")))?;
+            let value = inline
+                .or_else(|| rest.next())
+                .ok_or_else(|| UsageError(format!("expected a value after {name}")))?;
             if name == "--config" {
                 globals.config = Some(value.into());
             } else {
@@ -105,7 +110,10 @@ impl Context {
             path.exists()
         };
         if occupied && !self.force {
-            anyhow::bail!("{}: exists already and is not overwritten; remove it, choose another name or pass --force", path.display());
+            anyhow::bail!(
+                "{}: exists already and is not overwritten; remove it, choose another name or pass --force",
+                path.display()
+            );
         }
         Ok(())
     }

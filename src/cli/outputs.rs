@@ -24,15 +24,29 @@ impl Outputs {
     pub fn check(&self, inputs: &[&Path], context: &Context) -> anyhow::Result<()> {
         for (index, (option, path)) in self.paths.iter().enumerate() {
             if let Some((other, _)) = self.paths.iter().take(index).find(|(_, other)| same_place(other, path)) {
-                bail!(UsageError(format!("{option}: expected another path than {other}'s, found {} twice", path.display())));
+                bail!(UsageError(format!(
+                    "{option}: expected another path than {other}'s, found {} twice",
+                    path.display()
+                )));
             }
             if inputs.iter().any(|input| same_place(input, path)) {
-                bail!("{option} {}: is the input as well and is never overwritten; choose another output", path.display());
+                bail!(
+                    "{option} {}: is the input as well and is never overwritten; choose another output",
+                    path.display()
+                );
             }
             context.refuse_overwriting(path)?;
-            let folder = if is_folder(path) { path.as_path() } else { path.parent().unwrap_or(Path::new("")) };
+            let folder = if is_folder(path) {
+                path.as_path()
+            } else {
+                path.parent().unwrap_or(Path::new(""))
+            };
             if !is_folder(path) && !folder.as_os_str().is_empty() && !folder.is_dir() {
-                bail!("{option} {}: expected the folder {} to be there; make it first", path.display(), folder.display());
+                bail!(
+                    "{option} {}: expected the folder {} to be there; make it first",
+                    path.display(),
+                    folder.display()
+                );
             }
         }
         Ok(())
@@ -50,7 +64,11 @@ pub fn beside(output: &Path, name: &str) -> Option<PathBuf> {
     if output == Path::new("-") {
         return None;
     }
-    let folder = if output.to_string_lossy().ends_with('/') { Some(output) } else { output.parent() };
+    let folder = if output.to_string_lossy().ends_with('/') {
+        Some(output)
+    } else {
+        output.parent()
+    };
     folder.map(|folder| folder.join(name))
 }
 

@@ -104,18 +104,34 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     let span = TimeSpan::checked(args)?;
     let output = Output::from_argument(&args.output).map_err(|error| UsageError(error.to_string()))?;
     let recording = open_recording(&args.input)?;
-    let input = if args.input == Path::new("-") { Input::Y4mStdin } else { Input::from_argument(recording.video.path()) };
+    let input = if args.input == Path::new("-") {
+        Input::Y4mStdin
+    } else {
+        Input::from_argument(recording.video.path())
+    };
     check_outputs(args, &recording, context)?;
 
     let reader = VideoReader::open(&input)?;
     let info = reader.info().clone();
     recording.check_video_size(info.width, info.height)?;
     let light_field = match &args.light_field {
-        Some(folder) => Some(Arc::new(light_field_build::open(folder, &BuildSettings::default(), &context.console)?)),
+        Some(folder) => Some(Arc::new(light_field_build::open(
+            folder,
+            &BuildSettings::default(),
+            &context.console,
+        )?)),
         None => None,
     };
-    let equipment = Equipment { recording: &recording, light_field, size: (info.width, info.height) };
-    let Line { stages, left_out, output_camera } = compose::line(&context.config, &args.stages, &equipment)?;
+    let equipment = Equipment {
+        recording: &recording,
+        light_field,
+        size: (info.width, info.height),
+    };
+    let Line {
+        stages,
+        left_out,
+        output_camera,
+    } = compose::line(&context.config, &args.stages, &equipment)?;
     for part in &left_out {
         tracing::warn!("{part}");
     }
@@ -125,7 +141,11 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     writing.preset.clone_from(&context.config.output.preset);
     writing.origin = span.start.unwrap_or(Timestamp(0));
     if let (true, Output::File(_), Input::File(path)) = (info.has_audio, &output, &input) {
-        writing.sound = Some(Sound { path: path.clone(), start: span.start, end: span.end });
+        writing.sound = Some(Sound {
+            path: path.clone(),
+            start: span.start,
+            end: span.end,
+        });
     }
     let queue = Queue::blocking(context.config.line.frames_before_sinks);
     let clock: Arc<dyn Clock> = Arc::new(MonotonicClock);
@@ -145,7 +165,10 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     for stage in stages {
         builder = builder.stage(stage);
     }
-    builder = builder.essential_sink(Box::new(VideoSink::new(VideoWriter::create(&output, &writing, context.force)?)), queue);
+    builder = builder.essential_sink(
+        Box::new(VideoSink::new(VideoWriter::create(&output, &writing, context.force)?)),
+        queue,
+    );
     if let Some(path) = &args.mask_out {
         let output = Output::from_argument(path).map_err(|error| UsageError(error.to_string()))?;
         let writer = VideoWriter::create(&output, &writing.for_masks(), context.force)?;
@@ -153,8 +176,15 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     }
     if let Some(path) = &args.side_by_side {
         let output = Output::from_argument(path).map_err(|error| UsageError(error.to_string()))?;
-        let wide = WriterSettings { width: SideBySideSink::output_width(info.width), sound: None, ..writing.clone() };
-        builder = builder.sink(Box::new(SideBySideSink::new(VideoWriter::create(&output, &wide, context.force)?)), queue);
+        let wide = WriterSettings {
+            width: SideBySideSink::output_width(info.width),
+            sound: None,
+            ..writing.clone()
+        };
+        builder = builder.sink(
+            Box::new(SideBySideSink::new(VideoWriter::create(&output, &wide, context.force)?)),
+            queue,
+        );
     }
     for sink in extra {
         builder = builder.essential_sink(sink, queue);
@@ -167,7 +197,10 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
 
     let began = clock.now();
     let running = running.start()?;
-    context.console.begin("process", span.frames(info.frame_count, info.duration_s, info.frames_per_second()));
+    context.console.begin(
+        "process",
+        span.frames(info.frame_count, info.duration_s, info.frames_per_second()),
+    );
     let mut shown = 0;
     let outcome = running.wait_looking(|status| {
         context.console.advance(status.frames_out - shown);
@@ -256,15 +289,23 @@ impl TimeSpan {
     fn checked(args: &Args) -> anyhow::Result<Self> {
         for (option, seconds) in [("--start", args.start), ("--end", args.end)] {
             if seconds.is_some_and(|s| !s.is_finite() || s < 0.0) {
-                bail!(UsageError(format!("{option}: expected seconds from 0 on, found {}", seconds.unwrap_or_default())));
+                bail!(UsageError(format!(
+                    "{option}: expected seconds from 0 on, found {}",
+                    seconds.unwrap_or_default()
+                )));
             }
         }
         if let (Some(start), Some(end)) = (args.start, args.end)
             && end <= start
         {
-            bail!(UsageError(format!("--end: expected more than --start's {start} s, found {end} s")));
+            bail!(UsageError(format!(
+                "--end: expected more than --start's {start} s, found {end} s"
+            )));
         }
-        Ok(Self { start: args.start.map(Timestamp::from_seconds), end: args.end.map(Timestamp::from_seconds) })
+        Ok(Self {
+            start: args.start.map(Timestamp::from_seconds),
+            end: args.end.map(Timestamp::from_seconds),
+        })
     }
 
     /// How many frames that will be, as far as can be told; 0 = unknown.
@@ -281,7 +322,9 @@ impl TimeSpan {
 
 /// `camera.yaml` beside the output. Another camera's file that lies there is left alone; ours then takes the output's name.
 fn write_camera(camera: &CameraModel, args: &Args, recording: &Recording, context: &Context) -> anyhow::Result<()> {
-    let Some(mut path) = beside(&args.output, "camera.yaml") else { return Ok(()) };
+    let Some(mut path) = beside(&args.output, "camera.yaml") else {
+        return Ok(());
+    };
     if let Ok(present) = camera_file::read(&path) {
         if present == *camera {
             return Ok(());
@@ -289,9 +332,16 @@ fn write_camera(camera: &CameraModel, args: &Args, recording: &Recording, contex
         // A recording's own calibration is never written over, even with --force.
         let own = recording.camera.as_ref() == Some(&present);
         if own || !context.force {
-            let stem = args.output.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+            let stem = args
+                .output
+                .file_stem()
+                .map(|stem| stem.to_string_lossy().into_owned())
+                .unwrap_or_default();
             path.set_file_name(format!("{stem}.camera.yaml"));
-            tracing::warn!("camera.yaml beside the output belongs to another camera and stays; the output's is {}", path.display());
+            tracing::warn!(
+                "camera.yaml beside the output belongs to another camera and stays; the output's is {}",
+                path.display()
+            );
         }
     }
     camera_file::write(&path, camera, "undistorted").with_context(|| format!("writing {}", path.display()))

@@ -102,9 +102,17 @@ impl Report {
             interrupted: outcome.stopped,
             faults,
             left_out,
-            frames: FrameCounts { entered: outcome.frames_in, left: outcome.frames_out, dropped: outcome.frames_dropped },
+            frames: FrameCounts {
+                entered: outcome.frames_in,
+                left: outcome.frames_out,
+                dropped: outcome.frames_dropped,
+            },
             seconds,
-            frames_per_second: if seconds > 0.0 { outcome.frames_out as f64 / seconds } else { 0.0 },
+            frames_per_second: if seconds > 0.0 {
+                outcome.frames_out as f64 / seconds
+            } else {
+                0.0
+            },
             source: outcome.source_working.summary(),
             stages: outcome
                 .stages
@@ -136,13 +144,17 @@ impl Report {
     /// Write it as JSON.
     pub fn write(&self, path: &Path) -> anyhow::Result<()> {
         let text = serde_json::to_string_pretty(self)?;
-        std::fs::write(path, text + "\n").with_context(|| format!("{}: cannot be written; check folder, rights and space", path.display()))
+        std::fs::write(path, text + "\n")
+            .with_context(|| format!("{}: cannot be written; check folder, rights and space", path.display()))
     }
 
     /// Milliseconds per stage as a table for a terminal.
     pub fn timing_table(&self) -> String {
         let row = |name: &str, times: &Summary| {
-            format!("  {name:<26}{:>9.2}{:>9.2}{:>9.2}{:>9.2}\n", times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms)
+            format!(
+                "  {name:<26}{:>9.2}{:>9.2}{:>9.2}{:>9.2}\n",
+                times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms
+            )
         };
         let mut table = format!("  {:<26}{:>9}{:>9}{:>9}{:>9}\n", "ms per frame", "p50", "p95", "p99", "max");
         table += &row("source", &self.source);

@@ -27,7 +27,7 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { darkest_surround_levels: 40, step_levels: 18, min_agreement: 0.35, seed: 1 }
+        Self { darkest_surround_levels: 40, step_levels: 12, min_agreement: 0.35, seed: 1 }
     }
 }
 
@@ -207,7 +207,7 @@ fn sharp_rim(brightest: &Mask, circle: Circle, rim: &[(f64, f64)], step_levels: 
         .collect();
     steps.sort_unstable_by(f64::total_cmp);
     let median = *steps.get(steps.len() / 2)?;
-    (median >= 1.5 * f64::from(step_levels)).then_some(circle)
+    (median >= 2.0 * f64::from(step_levels)).then_some(circle)
 }
 
 /// The disc, cut where a straight edge (a rounded rectangle's side) ends it earlier than its rim.

@@ -60,6 +60,9 @@ pub enum RemapError {
     },
 }
 
+/// Fills one output row from its entries, its blocks' bases and the source.
+pub(crate) type RowKernel = fn(&[u32], &[u32], &Image<Rgb8>, &mut [Rgb8]);
+
 /// A place in the source: the pixel to the upper left and 1/32 px from it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Place {
@@ -103,11 +106,21 @@ impl RemapTable {
                 RowOfTable::new(&places, y, source_width, source_height)
             })
             .collect();
-        let mut table = Self { width, height, source_width, source_height, entries: Vec::new(), bases: Vec::new(), edges: Vec::new() };
+        let mut table = Self {
+            width,
+            height,
+            source_width,
+            source_height,
+            entries: Vec::new(),
+            bases: Vec::new(),
+            edges: Vec::new(),
+        };
         for (y, row) in rows?.into_iter().enumerate() {
             table.entries.extend(row.entries);
             table.bases.extend(row.bases);
-            table.edges.extend(row.edges.into_iter().map(|(x, place)| ((y * width + x) as u32, place)));
+            table
+                .edges
+                .extend(row.edges.into_iter().map(|(x, place)| ((y * width + x) as u32, place)));
         }
         Ok(table)
     }
@@ -126,7 +139,10 @@ impl RemapTable {
     pub fn position(&self, x: usize, y: usize) -> Option<(f64, f64)> {
         let place = self.place(x, y)?;
         let step = STEPS_PER_PX as f64;
-        Some((f64::from(place.x) + f64::from(place.fx) / step, f64::from(place.y) + f64::from(place.fy) / step))
+        Some((
+            f64::from(place.x) + f64::from(place.fx) / step,
+            f64::from(place.y) + f64::from(place.fy) / step,
+        ))
     }
 
     pub(crate) fn place(&self, x: usize, y: usize) -> Option<Place> {
@@ -139,12 +155,21 @@ impl RemapTable {
         let base = *self.bases.get(y * self.width.div_ceil(BLOCK) + x / BLOCK)? as usize;
         let pixel = base + (entry >> FRACTION_BITS) as usize;
         let (x, y) = ((pixel % self.source_width) as i32, (pixel / self.source_width) as i32);
-        Some(Place { x, y, fx: (entry & 31) as u8, fy: (entry >> 5 & 31) as u8 })
+        Some(Place {
+            x,
+            y,
+            fx: (entry & 31) as u8,
+            fy: (entry >> 5 & 31) as u8,
+        })
     }
 
     fn check_source(&self, found: (usize, usize)) -> Result<(), RemapError> {
         let expected = self.source_size();
-        if expected == found { Ok(()) } else { Err(RemapError::SourceSize { expected, found }) }
+        if expected == found {
+            Ok(())
+        } else {
+            Err(RemapError::SourceSize { expected, found })
+        }
     }
 
     /// Remap a color picture; `out` takes the table's size. Allocates only when `out` must grow.
@@ -153,12 +178,14 @@ impl RemapTable {
         if out.size() != self.size() {
             out.resize(self.width, self.height, [0; 3]);
         }
-        let row_kernel: fn(&[u32], &[u32], &Image<Rgb8>, &mut [Rgb8]) = match interpolation {
+        let row_kernel: RowKernel = match interpolation {
             Interpolation::Nearest => nearest_row,
             Interpolation::Bilinear => remap_bilinear::row_kernel(),
-            Interpolation::Bicubic => remap_bicubic::row,
+            Interpolation::Bicubic => remap_bicubic::row_kernel(),
         };
-        self.each_row(out.pixels_mut(), |entries, bases, row| row_kernel(entries, bases, source, row));
+        self.each_row(out.pixels_mut(), |entries, bases, row| {
+            row_kernel(entries, bases, source, row)
+        });
         let edge_kernel: fn(&Image<Rgb8>, Place) -> Rgb8 = match interpolation {
             Interpolation::Nearest => |image, place| nearest_at(image, place).unwrap_or([0; 3]),
             Interpolation::Bilinear => bilinear_at,
@@ -179,7 +206,11 @@ impl RemapTable {
         }
         let nearest = interpolation == Interpolation::Nearest;
         self.each_row(out.pixels_mut(), |entries, bases, row| {
-            if nearest { nearest_row(entries, bases, source, row) } else { mask_bilinear_row(entries, bases, source, row) }
+            if nearest {
+                nearest_row(entries, bases, source, row)
+            } else {
+                mask_bilinear_row(entries, bases, source, row)
+            }
         });
         let pixels = out.pixels_mut();
         for (pixel, place) in &self.edges {
@@ -199,7 +230,10 @@ impl RemapTable {
             .zip(self.entries.par_chunks(self.width * ROWS_PER_BAND))
             .zip(self.bases.par_chunks(blocks * ROWS_PER_BAND))
             .for_each(|((out, entries), bases)| {
-                let rows = out.chunks_mut(self.width).zip(entries.chunks(self.width)).zip(bases.chunks(blocks));
+                let rows = out
+                    .chunks_mut(self.width)
+                    .zip(entries.chunks(self.width))
+                    .zip(bases.chunks(blocks));
                 for ((row, entries), bases) in rows {
                     kernel(entries, bases, row);
                 }
@@ -228,7 +262,11 @@ struct RowOfTable {
 
 impl RowOfTable {
     fn new(places: &[Option<Place>], y: usize, source_width: usize, source_height: usize) -> Result<Self, RemapError> {
-        let mut row = Self { entries: Vec::with_capacity(places.len()), bases: Vec::new(), edges: Vec::new() };
+        let mut row = Self {
+            entries: Vec::with_capacity(places.len()),
+            bases: Vec::new(),
+            edges: Vec::new(),
+        };
         let (last_x, last_y) = (source_width as i32 - 1, source_height as i32 - 1);
         for (block_number, block) in places.chunks(BLOCK).enumerate() {
             let pixel = |place: &Place| (place.y as usize * source_width + place.x as usize) as u32;
@@ -237,7 +275,13 @@ impl RowOfTable {
                 let inside = p.x >= 0 && p.y >= 0 && p.x < last_x && p.y < last_y;
                 inside && (p.x + 1 < last_x || p.y + 1 < last_y)
             };
-            let base = block.iter().flatten().filter(|place| inner(place)).map(pixel).min().unwrap_or(0);
+            let base = block
+                .iter()
+                .flatten()
+                .filter(|place| inner(place))
+                .map(pixel)
+                .min()
+                .unwrap_or(0);
             row.bases.push(base);
             for (i, place) in block.iter().enumerate() {
                 let x = block_number * BLOCK + i;
@@ -295,7 +339,11 @@ fn bilinear_at(image: &Image<Rgb8>, place: Place) -> Rgb8 {
 }
 
 fn nearest_at<P: Copy>(image: &Image<P>, place: Place) -> Option<P> {
-    pixel_at(image, place.x + i32::from(place.fx >= 16), place.y + i32::from(place.fy >= 16))
+    pixel_at(
+        image,
+        place.x + i32::from(place.fx >= 16),
+        place.y + i32::from(place.fy >= 16),
+    )
 }
 
 fn nearest_row<P: Copy + Default>(entries: &[u32], bases: &[u32], source: &Image<P>, out: &mut [P]) {

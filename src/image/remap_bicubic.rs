@@ -1,7 +1,7 @@
 //! The bicubic kernel of [`crate::image::remap`]: Keys 1981 (DOI 10.1109/TASSP.1981.1163711), a = −0.75 as in OpenCV.
 
 use crate::image::buffer::{Image, Rgb8};
-use crate::image::remap::{BLOCK, OUTSIDE, Place, pixel_at, unpacked};
+use crate::image::remap::{BLOCK, OUTSIDE, Place, RowKernel, pixel_at, unpacked};
 
 /// Weights are multiples of 1/2048: two passes then stay within 32 bits.
 const WEIGHT_BITS: u32 = 11;
@@ -35,8 +35,17 @@ const fn rounded(value: f64) -> i32 {
     if value < 0.0 { (value - 0.5) as i32 } else { (value + 0.5) as i32 }
 }
 
-/// One output row.
-pub(crate) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
+/// The fastest kernel for this machine.
+pub(crate) fn row_kernel() -> RowKernel {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        return avx2::row;
+    }
+    row
+}
+
+/// One output row, any machine.
+fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
     let width = source.width();
     for ((entries, out), base) in entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(bases) {
         for (entry, out) in entries.iter().zip(out) {
@@ -44,32 +53,14 @@ pub(crate) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mu
                 *out = [0; 3];
                 continue;
             }
-            let (at, fx, fy) = unpacked(*entry, *base);
-            let (x, y) = (at % width, at / width);
-            *out = inner(source, x, y, fx as usize, fy as usize).unwrap_or_else(|| {
-                at_border(source, Place { x: x as i32, y: y as i32, fx: fx as u8, fy: fy as u8 })
-            });
+            *out = at(source, place_of(*entry, *base, width));
         }
     }
 }
 
-/// Where all sixteen pixels are in the picture.
-#[inline(always)]
-fn inner(source: &Image<Rgb8>, x: usize, y: usize, fx: usize, fy: usize) -> Option<Rgb8> {
-    let (wx, wy) = (&WEIGHTS[fx & 31], &WEIGHTS[fy & 31]);
-    if x < 1 || y < 1 || x + 2 >= source.width() {
-        return None;
-    }
-    let mut sums = [0_i32; 3];
-    for (k, weight) in wy.iter().enumerate() {
-        let start = (y + k - 1) * source.width() + x - 1;
-        let four = source.pixels().get(start..)?.first_chunk::<4>()?;
-        for c in 0..3 {
-            let across: i32 = (0..4).map(|i| i32::from(four[i][c]) * wx[i]).sum();
-            sums[c] += across * weight;
-        }
-    }
-    Some(sums.map(to_byte))
+fn place_of(entry: u32, base: u32, width: usize) -> Place {
+    let (pixel, fx, fy) = unpacked(entry, base);
+    Place { x: (pixel % width) as i32, y: (pixel / width) as i32, fx: fx as u8, fy: fy as u8 }
 }
 
 fn to_byte(sum: i32) -> u8 {
@@ -79,10 +70,6 @@ fn to_byte(sum: i32) -> u8 {
 
 /// Anywhere; outside the picture is black.
 pub(crate) fn at(source: &Image<Rgb8>, place: Place) -> Rgb8 {
-    at_border(source, place)
-}
-
-fn at_border(source: &Image<Rgb8>, place: Place) -> Rgb8 {
     let (wx, wy) = (&WEIGHTS[usize::from(place.fx & 31)], &WEIGHTS[usize::from(place.fy & 31)]);
     let mut sums = [0_i32; 3];
     for (dy, weight_y) in (-1..).zip(wy) {
@@ -94,6 +81,68 @@ fn at_border(source: &Image<Rgb8>, place: Place) -> Rgb8 {
         }
     }
     sums.map(to_byte)
+}
+
+#[cfg(target_arch = "x86_64")]
+mod avx2 {
+    use std::arch::x86_64::{
+        __m128i, _mm_set_epi64x, _mm_set_epi8, _mm_shuffle_epi8, _mm256_add_epi32, _mm256_cvtepu8_epi16, _mm256_extract_epi32,
+        _mm256_hadd_epi32, _mm256_madd_epi16, _mm256_mullo_epi32, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_setzero_si256,
+    };
+
+    use super::{BLOCK, OUTSIDE, WEIGHTS, at, place_of, to_byte, unpacked};
+    use crate::image::buffer::{Image, Rgb8};
+
+    pub(super) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
+        #[expect(unsafe_code, reason = "AVX2 makes the bicubic remap of a 1080p frame several times faster")]
+        // SAFETY: `row_kernel` hands this function out only where the machine has AVX2.
+        unsafe {
+            row_avx2(entries, bases, source, out);
+        }
+    }
+
+    #[target_feature(enable = "avx2")]
+    fn row_avx2(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
+        let width = source.width();
+        for ((entries, out), base) in entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(bases) {
+            for (entry, out) in entries.iter().zip(out) {
+                *out = if *entry == OUTSIDE {
+                    [0; 3]
+                } else {
+                    inner(source.as_bytes(), width, *entry, *base).unwrap_or_else(|| at(source, place_of(*entry, *base, width)))
+                };
+            }
+        }
+    }
+
+    /// `None` where the sixteen pixels are not all in the picture, or too close to its end to be read as a whole.
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn inner(bytes: &[u8], width: usize, entry: u32, base: u32) -> Option<Rgb8> {
+        let (pixel, fx, fy) = unpacked(entry, base);
+        let column = pixel % width;
+        if column == 0 || column + 2 >= width {
+            return None;
+        }
+        let start = 3 * pixel.checked_sub(width + 1)?;
+        let [a, b, c, d] = WEIGHTS[(fx & 31) as usize].map(|w| (w as u16) as u64);
+        let across = _mm256_set1_epi64x((a | b << 16 | c << 32 | d << 48) as i64);
+        // r r r r g g g g b b b b of four neighbours.
+        let order: __m128i = _mm_set_epi8(-1, -1, -1, -1, 11, 8, 5, 2, 10, 7, 4, 1, 9, 6, 3, 0);
+        let mut sums = _mm256_setzero_si256();
+        for (k, weight) in WEIGHTS[(fy & 31) as usize].iter().enumerate() {
+            let chunk = bytes.get(start + 3 * width * k..)?.first_chunk::<16>()?;
+            let (low, high) = (u64::from_le_bytes(*chunk.first_chunk::<8>()?), u64::from_le_bytes(*chunk.last_chunk::<8>()?));
+            let neighbours = _mm_shuffle_epi8(_mm_set_epi64x(high as i64, low as i64), order);
+            let row = _mm256_madd_epi16(_mm256_cvtepu8_epi16(neighbours), across);
+            sums = _mm256_add_epi32(sums, _mm256_mullo_epi32(row, _mm256_set1_epi32(*weight)));
+        }
+        // Two halves a channel: r r g g | b b 0 0.
+        let halves = _mm256_hadd_epi32(sums, sums);
+        let [r, g, b] =
+            [_mm256_extract_epi32::<0>(halves), _mm256_extract_epi32::<1>(halves), _mm256_extract_epi32::<4>(halves)];
+        Some([to_byte(r), to_byte(g), to_byte(b)])
+    }
 }
 
 #[cfg(test)]

@@ -5,10 +5,10 @@
 //! (`pmaddubsw`), then with (32−fy, fy) (`pmaddwd`): three exact sums in 1/1024. Two output pixels share a register.
 
 use crate::image::buffer::{Image, Rgb8};
-use crate::image::remap::{BLOCK, OUTSIDE, blend, pair, unpacked};
+use crate::image::remap::{BLOCK, OUTSIDE, RowKernel, blend, pair, unpacked};
 
 /// The fastest kernel for this machine.
-pub(crate) fn row_kernel() -> fn(&[u32], &[u32], &Image<Rgb8>, &mut [Rgb8]) {
+pub(crate) fn row_kernel() -> RowKernel {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         return avx2::row;
@@ -40,16 +40,17 @@ fn pixel(entry: u32, base: u32, source: &Image<Rgb8>) -> Rgb8 {
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
     use std::arch::x86_64::{
-        __m256i, _mm256_add_epi32, _mm256_extract_epi64, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_packus_epi16,
-        _mm256_packus_epi32, _mm256_set_epi32, _mm256_set_epi64x, _mm256_set1_epi32, _mm256_setr_epi8, _mm256_shuffle_epi8,
-        _mm256_srli_epi32,
+        __m256i, _mm_and_si128, _mm_cmpeq_epi32, _mm_movemask_epi8, _mm_or_si128, _mm_set_epi32, _mm_set1_epi32, _mm_slli_epi32,
+        _mm_srli_epi32, _mm_sub_epi32, _mm256_add_epi32, _mm256_broadcastsi128_si256, _mm256_extract_epi64, _mm256_madd_epi16,
+        _mm256_maddubs_epi16, _mm256_packus_epi16, _mm256_packus_epi32, _mm256_permutevar8x32_epi32, _mm256_set_epi64x,
+        _mm256_set1_epi32, _mm256_setr_epi8, _mm256_setr_epi32, _mm256_shuffle_epi8, _mm256_srli_epi32,
     };
 
     use crate::image::buffer::{Image, Rgb8};
-    use crate::image::remap::{BLOCK, OUTSIDE, unpacked};
+    use crate::image::remap::{BLOCK, unpacked};
 
     pub(super) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
-        #[expect(unsafe_code, reason = "AVX2 makes the remap of a 1080p frame several times faster; see benches")]
+        #[expect(unsafe_code, reason = "AVX2 makes the remap of a 1080p frame several times faster")]
         // SAFETY: `row_kernel` hands this function out only where the machine has AVX2.
         unsafe {
             row_avx2(entries, bases, source, out);
@@ -59,16 +60,13 @@ mod avx2 {
     #[target_feature(enable = "avx2")]
     fn row_avx2(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
         let bytes = source.as_bytes();
-        let stride = 3 * source.width();
+        // From the first byte of the upper left pixel to the last of the eight read below it.
+        let reach = 3 * source.width() + 8;
         for ((entries, out), base) in entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(bases) {
             let (quads, rest) = entries.as_chunks::<4>();
             let (out_quads, out_rest) = out.as_chunks_mut::<4>();
             for (quad, out) in quads.iter().zip(out_quads) {
-                *out = if quad.contains(&OUTSIDE) {
-                    quad.map(|entry| super::pixel(entry, *base, source))
-                } else {
-                    four(quad, *base, bytes, stride)
-                };
+                *out = four(quad, *base, bytes, reach).unwrap_or_else(|| quad.map(|entry| super::pixel(entry, *base, source)));
             }
             for (entry, out) in rest.iter().zip(out_rest) {
                 *out = super::pixel(*entry, *base, source);
@@ -76,43 +74,51 @@ mod avx2 {
         }
     }
 
+    /// `None` when one of the four lies outside.
     #[inline]
     #[target_feature(enable = "avx2")]
-    fn four(quad: &[u32; 4], base: u32, bytes: &[u8], stride: usize) -> [Rgb8; 4] {
-        let sums = [two(quad[0], quad[1], base, bytes, stride), two(quad[2], quad[3], base, bytes, stride)];
-        // Lane 0: pixels 0 and 2, lane 1: pixels 1 and 3; each r g b 0.
-        let words = _mm256_packus_epi32(sums[0], sums[1]);
-        let packed = _mm256_packus_epi16(words, words);
-        let even = _mm256_extract_epi64::<0>(packed).to_le_bytes();
-        let odd = _mm256_extract_epi64::<2>(packed).to_le_bytes();
-        [[even[0], even[1], even[2]], [odd[0], odd[1], odd[2]], [even[4], even[5], even[6]], [odd[4], odd[5], odd[6]]]
-    }
-
-    /// Two output pixels, r g b 0 in 32 bits each, one a lane.
-    #[inline]
-    #[target_feature(enable = "avx2")]
-    fn two(first: u32, second: u32, base: u32, bytes: &[u8], stride: usize) -> __m256i {
-        let (at0, fx0, fy0) = unpacked(first, base);
-        let (at1, fx1, fy1) = unpacked(second, base);
-        let load = |at: usize| {
-            // The table holds only pixels with room for eight bytes in both rows; anything else would be a bug, and black.
-            bytes.get(at..).and_then(|rest| rest.first_chunk::<8>()).map_or(0, |chunk| i64::from_le_bytes(*chunk))
+    fn four(quad: &[u32; 4], base: u32, bytes: &[u8], reach: usize) -> Option<[Rgb8; 4]> {
+        let entries = _mm_set_epi32(quad[3] as i32, quad[2] as i32, quad[1] as i32, quad[0] as i32);
+        if _mm_movemask_epi8(_mm_cmpeq_epi32(entries, _mm_set1_epi32(-1))) != 0 {
+            return None;
+        }
+        // Weights per 32 bits: bytes (32−fx, fx, 32−fx, fx), words (32−fy, fy).
+        let (low_five, all) = (_mm_set1_epi32(31), _mm_set1_epi32(32));
+        let (fx, fy) = (_mm_and_si128(entries, low_five), _mm_and_si128(_mm_srli_epi32::<5>(entries), low_five));
+        let across = _mm_or_si128(_mm_sub_epi32(all, fx), _mm_slli_epi32::<8>(fx));
+        let across = _mm256_broadcastsi128_si256(_mm_or_si128(across, _mm_slli_epi32::<16>(across)));
+        let down = _mm256_broadcastsi128_si256(_mm_or_si128(_mm_sub_epi32(all, fy), _mm_slli_epi32::<16>(fy)));
+        let window = |entry: u32| {
+            let at = 3 * unpacked(entry, base).0;
+            let window = bytes.get(at..at + reach)?;
+            Some((i64::from_le_bytes(*window.first_chunk::<8>()?), i64::from_le_bytes(*window.last_chunk::<8>()?)))
         };
-        let (at0, at1) = (3 * at0, 3 * at1);
-        let neighbours = _mm256_set_epi64x(load(at1 + stride), load(at1), load(at0 + stride), load(at0));
-        let order = _mm256_setr_epi8(
-            0, 3, 8, 11, 1, 4, 9, 12, 2, 5, 10, 13, -1, -1, -1, -1, 0, 3, 8, 11, 1, 4, 9, 12, 2, 5, 10, 13, -1, -1, -1, -1,
+        let sums = |first: u32, second: u32, lanes: __m256i| {
+            let ((top0, bottom0), (top1, bottom1)) = (window(first)?, window(second)?);
+            let neighbours = _mm256_set_epi64x(bottom1, top1, bottom0, top0);
+            let order = _mm256_setr_epi8(
+                0, 3, 8, 11, 1, 4, 9, 12, 2, 5, 10, 13, -1, -1, -1, -1, 0, 3, 8, 11, 1, 4, 9, 12, 2, 5, 10, 13, -1, -1, -1, -1,
+            );
+            let ordered = _mm256_shuffle_epi8(neighbours, order);
+            let rows = _mm256_maddubs_epi16(ordered, _mm256_permutevar8x32_epi32(across, lanes));
+            let sums = _mm256_madd_epi16(rows, _mm256_permutevar8x32_epi32(down, lanes));
+            Some(_mm256_srli_epi32::<10>(_mm256_add_epi32(sums, _mm256_set1_epi32(512))))
+        };
+        let even = sums(quad[0], quad[2], _mm256_setr_epi32(0, 0, 0, 0, 2, 2, 2, 2))?;
+        let odd = sums(quad[1], quad[3], _mm256_setr_epi32(1, 1, 1, 1, 3, 3, 3, 3))?;
+        // Lane 0 now holds pixels 0 and 1, lane 1 pixels 2 and 3, each r g b 0; then the zeros are squeezed out.
+        let words = _mm256_packus_epi32(even, odd);
+        let packed = _mm256_packus_epi16(words, words);
+        let squeeze = _mm256_setr_epi8(
+            0, 1, 2, 4, 5, 6, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, 0, 1, 2, 4, 5, 6, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1,
         );
-        let ordered = _mm256_shuffle_epi8(neighbours, order);
-        // Per 32 bits: bytes (32−fx, fx) twice; then 16-bit (32−fy, fy).
-        let across = |fx: u32| ((32 - fx) | fx << 8).wrapping_mul(0x0001_0001) as i32;
-        let down = |fy: u32| ((32 - fy) | fy << 16) as i32;
-        let (x0, x1, y0, y1) = (across(fx0), across(fx1), down(fy0), down(fy1));
-        let wx = _mm256_set_epi32(x1, x1, x1, x1, x0, x0, x0, x0);
-        let wy = _mm256_set_epi32(y1, y1, y1, y1, y0, y0, y0, y0);
-        let rows = _mm256_maddubs_epi16(ordered, wx);
-        let sums = _mm256_add_epi32(_mm256_madd_epi16(rows, wy), _mm256_set1_epi32(512));
-        _mm256_srli_epi32::<10>(sums)
+        let squeezed = _mm256_shuffle_epi8(packed, squeeze);
+        let left = _mm256_extract_epi64::<0>(squeezed) as u64;
+        let right = _mm256_extract_epi64::<2>(squeezed) as u64;
+        let mut pixels = [0_u8; 12];
+        pixels[..8].copy_from_slice(&(left | right << 48).to_le_bytes());
+        pixels[8..].copy_from_slice(&((right >> 16) as u32).to_le_bytes());
+        Some(bytemuck::cast(pixels))
     }
 }
 
@@ -160,9 +166,9 @@ mod tests {
             for y in 0..h {
                 for x in 0..w + 3 {
                     let expected = reference(&table, &source, x, y);
-                    for c in 0..3 {
-                        let difference = (f64::from(out.at(x, y)[c]) - expected[c]).abs();
-                        assert!(difference <= 0.5, "{w}x{h} ({x}, {y}) {c}: {difference}");
+                    for (found, expected) in out.at(x, y).iter().zip(expected) {
+                        let difference = (f64::from(*found) - expected).abs();
+                        assert!(difference <= 0.5, "{w}x{h} ({x}, {y}): {difference}");
                     }
                 }
             }

@@ -55,11 +55,11 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
-            core_levels: 34.0,
-            halo_levels: 14.0,
+            core_levels: 26.0,
+            halo_levels: 10.0,
             halo_reach_px: 9.0,
             background_sigma_px: 28.0,
-            max_width_px: 34.0,
+            max_width_px: 44.0,
             whiteness: 0.72,
             max_region_share: 0.012,
             steel_saturation: 0.2,

@@ -23,6 +23,8 @@ use crate::light_field::view::{LampShading, LightField, View};
 const BLOCK: usize = 16;
 /// Candidate views of a block.
 const CANDIDATES: usize = 12;
+/// Penalties of one view differ by less than this within a block, rad.
+const RANK_SLACK_RAD: f32 = 0.012;
 /// Views that are blended; k of the paper, as in its experiments.
 const BLENDED: usize = 4;
 /// Weight of relative resolution beside angle in rad (β/α of the paper).
@@ -243,7 +245,10 @@ impl Renderer {
         let eye_distance = from_eye.norm();
         let mut heard = [Heard::default(); BLENDED + 1];
         let mut count = 0;
-        for &(_, index) in candidates {
+        for &(rank, index) in candidates {
+            if count > BLENDED && rank > heard[BLENDED].penalty + RANK_SLACK_RAD {
+                break;
+            }
             let (source, view) = (&self.sources[index], &light_field.views[index]);
             let p = source.rotation * point + source.shift;
             if p.z <= 0.0 {

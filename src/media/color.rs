@@ -324,3 +324,105 @@ impl Planes {
 fn plane<'a>(store: &'a BufferStoreMut<'static, u8>) -> &'a [u8] {
     store.borrow()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Y', Cb, Cr by the definition (BT.601 §2.5, BT.709 §3), in 8 bits.
+    fn reference_yuv(rgb: Rgb8, red: f64, blue: f64, full: bool) -> [f64; 3] {
+        let [r, g, b] = rgb.map(f64::from);
+        let luma = red * r + (1.0 - red - blue) * g + blue * b;
+        let (cb, cr) = ((b - luma) / (2.0 * (1.0 - blue)), (r - luma) / (2.0 * (1.0 - red)));
+        if full {
+            [luma, 128.0 + cb, 128.0 + cr]
+        } else {
+            [
+                16.0 + luma * 219.0 / 255.0,
+                128.0 + cb * 224.0 / 255.0,
+                128.0 + cr * 224.0 / 255.0,
+            ]
+        }
+    }
+
+    fn tags(matrix: color::Space, full: bool) -> ColorTags {
+        let range = if full { color::Range::JPEG } else { color::Range::MPEG };
+        ColorTags {
+            matrix,
+            range,
+            ..ColorTags::UNTAGGED
+        }
+    }
+
+    #[test]
+    fn planes_follow_the_definition() {
+        let matrices = [(color::Space::SMPTE170M, 0.299, 0.114), (color::Space::BT709, 0.2126, 0.0722)];
+        for (matrix, red, blue) in matrices {
+            for full in [false, true] {
+                let tags = tags(matrix, full);
+                // 2x2 blocks of one colour, so that the chroma average is that of the colour.
+                let side = 128;
+                let color_of = |x: usize, y: usize| {
+                    let (i, j) = (x / 2, y / 2);
+                    [(i * 4) as u8, (j * 4) as u8, (i * 3 + j * 5) as u8]
+                };
+                let mut picture = Image::filled(side, side, [0; 3]);
+                for y in 0..side {
+                    for x in 0..side {
+                        picture.set(x, y, color_of(x, y));
+                    }
+                }
+                let mut planes = Planes::new(side, side, &tags);
+                planes.fill(&picture).unwrap();
+                let [y_plane, u_plane, v_plane] = planes.planes();
+                let mut bias = [0.0; 3];
+                for y in (0..side).step_by(2) {
+                    for x in (0..side).step_by(2) {
+                        let expected = reference_yuv(color_of(x, y), red, blue, full);
+                        let found = [
+                            y_plane.0[y * y_plane.1 + x],
+                            u_plane.0[y / 2 * u_plane.1 + x / 2],
+                            v_plane.0[y / 2 * v_plane.1 + x / 2],
+                        ];
+                        for ((bias, e), f) in bias.iter_mut().zip(expected).zip(found) {
+                            assert!((e - f64::from(f)).abs() <= 1.25, "{matrix:?} {full}: {e} {f}");
+                            *bias += (f64::from(f) - e) / (side * side / 4) as f64;
+                        }
+                    }
+                }
+                assert!(bias.iter().all(|b| b.abs() < 0.2), "{matrix:?} {full}: bias {bias:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn there_and_back_is_nearly_the_same() {
+        let tags = tags(color::Space::BT709, false);
+        let side = 64;
+        let picture = Image::from_vec(
+            side,
+            side,
+            (0..side * side)
+                .map(|i| [(i / 256 * 16) as u8, (i % 64 / 2 * 8) as u8, 90])
+                .collect(),
+        )
+        .unwrap();
+        let mut planes = Planes::new(side, side, &tags);
+        planes.fill(&picture).unwrap();
+        let mut frame = frame::Video::new(Pixel::YUV420P, side as u32, side as u32);
+        for (index, (plane, row)) in planes.planes().into_iter().enumerate() {
+            let stride = frame.stride(index);
+            for (from, to) in plane.chunks_exact(row).zip(frame.data_mut(index).chunks_mut(stride)) {
+                to[..row].copy_from_slice(from);
+            }
+        }
+        let mut back = Image::filled(side, side, [0; 3]);
+        rgb_from_frame(&frame, &tags, &mut back).unwrap();
+        let (mut bias, mut largest) = (0.0, 0);
+        for (a, b) in back.as_bytes().iter().zip(picture.as_bytes()) {
+            bias += (f64::from(*a) - f64::from(*b)) / (3 * side * side) as f64;
+            largest = largest.max(a.abs_diff(*b));
+        }
+        assert!(largest <= 3 && bias.abs() < 0.35, "largest {largest}, bias {bias}");
+    }
+}

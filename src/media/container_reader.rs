@@ -5,7 +5,6 @@
 //! offline path, where latency does not count.
 
 use std::path::{Path, PathBuf};
-use std::sync::Once;
 
 use ffmpeg_next::codec::packet::side_data;
 use ffmpeg_next::codec::{self, threading};
@@ -16,8 +15,10 @@ use ffmpeg_next::{Error, Packet, Rational, decoder, format, frame, media};
 use crate::image::buffer::Rgb8;
 use crate::image::pool::Pool;
 use crate::media::color::{self, ColorTags};
-use crate::media::error::{MediaError, libav_path};
+use crate::media::error::{MediaError, libav_path, not_a_video};
 use crate::media::filter::{DEINTERLACE, Filter};
+use crate::media::frame_index::packet_stamps;
+use crate::media::libav::{prepare_libav, timestamp_from_ticks};
 use crate::media::reader::{DecodedFrame, VideoInfo};
 use crate::media::truncation::{Shortfall, shortfall};
 use crate::time::{Span, Timestamp};
@@ -27,31 +28,6 @@ const DEFAULT_RATE: Rational = Rational(25, 1);
 
 /// Errors after which a decoder that is being emptied is given up.
 const MOST_ERRORS_AT_END: u64 = 1000;
-
-/// Prepare libav, once; its own messages are silenced, since every error is reported here.
-pub(crate) fn prepare_libav() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        if ffmpeg_next::init().is_err() {
-            tracing::warn!("libav could not be initialised");
-        }
-        ffmpeg_next::log::set_level(ffmpeg_next::log::Level::Quiet);
-    });
-}
-
-/// Time stamp of `ticks` units, exact to the nanosecond.
-pub(crate) fn timestamp_from_ticks(ticks: i64, unit: Rational) -> Timestamp {
-    let (numerator, denominator) = (i128::from(unit.numerator()), i128::from(unit.denominator().max(1)));
-    let doubled = 2 * i128::from(ticks) * numerator * 1_000_000_000;
-    Timestamp((doubled + denominator).div_euclid(2 * denominator) as i64)
-}
-
-/// Nearest number of units to a time stamp.
-pub(crate) fn ticks_from_timestamp(time: Timestamp, unit: Rational) -> i64 {
-    let divisor = i128::from(unit.numerator().max(1)) * 1_000_000_000;
-    let doubled = 2 * i128::from(time.0) * i128::from(unit.denominator());
-    (doubled + divisor).div_euclid(2 * divisor) as i64
-}
 
 /// A demuxer, a decoder, and what is needed between them.
 pub(crate) struct ContainerReader {
@@ -302,10 +278,10 @@ impl ContainerReader {
     /// Bring the next decoded (and deinterlaced) frame to `current`; false at the end.
     fn advance(&mut self) -> Result<bool, MediaError> {
         loop {
-            if let Some(filter) = &mut self.deinterlacer {
-                if filter.pull(&mut self.current).map_err(|e| self.decode_error(e))? {
-                    return Ok(true);
-                }
+            if let Some(filter) = &mut self.deinterlacer
+                && filter.pull(&mut self.current).map_err(|e| self.decode_error(e))?
+            {
+                return Ok(true);
             }
             if self.ended == Ended::DecoderDone || self.ended == Ended::Reported {
                 return self.report_end();
@@ -505,24 +481,6 @@ impl ContainerReader {
     }
 }
 
-/// Time stamps of all frames of a stream, in order, without decoding.
-fn packet_stamps(path: &Path, stream: usize) -> Result<Vec<Timestamp>, MediaError> {
-    let mut input = format::input(&libav_path(path)?).map_err(|e| not_a_video(path, &e.to_string(), "check the file"))?;
-    let unit = input.stream(stream).map_or(DEFAULT_RATE.invert(), |s| s.time_base());
-    let mut stamps = Vec::new();
-    let mut packet = Packet::empty();
-    while packet.read(&mut input).is_ok() {
-        if packet.stream() == stream && !packet.flags().contains(codec::packet::Flags::from_bits_truncate(4)) {
-            match packet.pts().or(packet.dts()) {
-                Some(ticks) => stamps.push(timestamp_from_ticks(ticks, unit)),
-                None => return Ok(Vec::new()),
-            }
-        }
-    }
-    stamps.sort_unstable();
-    Ok(stamps)
-}
-
 fn open_decoder(stream: &ffmpeg_next::Stream<'_>, name: &str) -> Result<decoder::Video, MediaError> {
     let codec = format!("{:?}", stream.parameters().id()).to_lowercase();
     let refuse = |_| MediaError::NoDecoder {
@@ -549,12 +507,4 @@ fn rotation_of(stream: &ffmpeg_next::Stream<'_>) -> i32 {
     // The matrix turns counter-clockwise in 16.16 fixed point; its first row is (a, b).
     let degrees = f64::from(word(1)).atan2(f64::from(word(0))).to_degrees().round() as i32;
     degrees.rem_euclid(360)
-}
-
-fn not_a_video(path: &Path, found: &str, advice: &str) -> MediaError {
-    MediaError::NotAVideo {
-        name: path.display().to_string(),
-        found: found.to_owned(),
-        advice: advice.to_owned(),
-    }
 }

@@ -15,8 +15,8 @@ use ffmpeg_next::{Dictionary, Error, Packet, Rational, color, encoder, format, f
 
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::media::color::Planes;
-use crate::media::container_reader::{prepare_libav, ticks_from_timestamp};
 use crate::media::error::{MediaError, libav_path};
+use crate::media::libav::{prepare_libav, ticks_from_timestamp};
 use crate::media::sound::SoundCopy;
 use crate::media::writer::{Content, WriterSettings};
 use crate::time::Timestamp;

@@ -169,3 +169,12 @@ pub(crate) fn libav_path(path: &Path) -> Result<String, MediaError> {
         }),
     }
 }
+
+/// The error for what libav cannot make a video of.
+pub(crate) fn not_a_video(path: &Path, found: &str, advice: &str) -> MediaError {
+    MediaError::NotAVideo {
+        name: path.display().to_string(),
+        found: found.to_owned(),
+        advice: advice.to_owned(),
+    }
+}

@@ -5,8 +5,8 @@ use std::path::Path;
 use ffmpeg_next::format::context;
 use ffmpeg_next::{Packet, Rational, format, media};
 
-use crate::media::container_reader::{prepare_libav, ticks_from_timestamp, timestamp_from_ticks};
 use crate::media::error::{MediaError, libav_path};
+use crate::media::libav::{prepare_libav, ticks_from_timestamp, timestamp_from_ticks};
 use crate::media::writer::Sound;
 use crate::time::Timestamp;
 

@@ -61,7 +61,10 @@ impl std::fmt::Debug for Pipeline {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let stages: Vec<_> = self.stages.iter().map(|stage| stage.name()).collect();
         let sinks: Vec<_> = self.taps.iter().chain(&self.sinks).map(|door| door.sink.name()).collect();
-        f.debug_struct("Pipeline").field("stages", &stages).field("sinks", &sinks).finish_non_exhaustive()
+        f.debug_struct("Pipeline")
+            .field("stages", &stages)
+            .field("sinks", &sinks)
+            .finish_non_exhaustive()
     }
 }
 
@@ -113,7 +116,11 @@ impl Builder {
     /// A sink of the untouched picture, which leaves before the first stage.
     #[must_use]
     pub fn tap(mut self, sink: Box<dyn Sink>, queue: Queue) -> Self {
-        self.taps.push(Door { sink, queue, essential: false });
+        self.taps.push(Door {
+            sink,
+            queue,
+            essential: false,
+        });
         self
     }
 
@@ -127,14 +134,22 @@ impl Builder {
     /// One more sink of finished frames. If it fails, the others go on.
     #[must_use]
     pub fn sink(mut self, sink: Box<dyn Sink>, queue: Queue) -> Self {
-        self.sinks.push(Door { sink, queue, essential: false });
+        self.sinks.push(Door {
+            sink,
+            queue,
+            essential: false,
+        });
         self
     }
 
     /// A sink without which the work is pointless: if it fails, the line stops cleanly.
     #[must_use]
     pub fn essential_sink(mut self, sink: Box<dyn Sink>, queue: Queue) -> Self {
-        self.sinks.push(Door { sink, queue, essential: true });
+        self.sinks.push(Door {
+            sink,
+            queue,
+            essential: true,
+        });
         self
     }
 
@@ -145,7 +160,12 @@ impl Builder {
         }
         let doors = || self.taps.iter().chain(&self.sinks);
         let mut seen = BTreeSet::new();
-        for name in self.stages.iter().map(|stage| stage.name()).chain(doors().map(|door| door.sink.name())) {
+        for name in self
+            .stages
+            .iter()
+            .map(|stage| stage.name())
+            .chain(doors().map(|door| door.sink.name()))
+        {
             if name.is_empty() {
                 return Err(BuildError::NoName);
             }

@@ -14,7 +14,11 @@ pub struct Switch {
 
 impl Switch {
     fn new(stage: &'static str) -> Self {
-        Self { stage, bypass: AtomicBool::new(false), strength_bits: AtomicU32::new(NOT_SET) }
+        Self {
+            stage,
+            bypass: AtomicBool::new(false),
+            strength_bits: AtomicU32::new(NOT_SET),
+        }
     }
 
     /// True when the stage is to be passed by.
@@ -50,7 +54,9 @@ pub struct Controls {
 
 impl Controls {
     pub(crate) fn for_stages(names: impl IntoIterator<Item = &'static str>) -> Self {
-        Self { switches: names.into_iter().map(Switch::new).collect() }
+        Self {
+            switches: names.into_iter().map(Switch::new).collect(),
+        }
     }
 
     /// The stages' names, in the order of the line.
@@ -64,10 +70,13 @@ impl Controls {
     }
 
     fn named(&self, stage: &str) -> Result<&Switch, UnknownStage> {
-        self.switches.iter().find(|switch| switch.stage == stage).ok_or_else(|| UnknownStage {
-            found: stage.to_owned(),
-            known: self.stages().collect::<Vec<_>>().join(", "),
-        })
+        self.switches
+            .iter()
+            .find(|switch| switch.stage == stage)
+            .ok_or_else(|| UnknownStage {
+                found: stage.to_owned(),
+                known: self.stages().collect::<Vec<_>>().join(", "),
+            })
     }
 
     /// Let frames pass `stage` unaltered from now on. Its history is forgotten when it is taken in again.

@@ -71,13 +71,19 @@ impl Outcome {
         let source = self.source_failure.iter().cloned();
         let stages = self.stages.iter().filter_map(|stage| {
             let panic = stage.panic.as_ref()?;
-            Some(format!("stage `{}` failed beyond repair and was bypassed from then on: {panic}", stage.name))
+            Some(format!(
+                "stage `{}` failed beyond repair and was bypassed from then on: {panic}",
+                stage.name
+            ))
         });
         let sinks = self.sinks.iter().filter_map(|sink| {
             let failure = sink.failure.as_ref()?;
             Some(format!("{} ended after {} frames: {failure}", sink.name, sink.taken))
         });
-        let threads = self.lost_threads.iter().map(|thread| format!("thread `{thread}` of the line died"));
+        let threads = self
+            .lost_threads
+            .iter()
+            .map(|thread| format!("thread `{thread}` of the line died"));
         source.chain(stages).chain(sinks).chain(threads).collect()
     }
 }

@@ -29,12 +29,18 @@ pub struct Queue {
 impl Queue {
     /// The sender waits when `capacity` items wait.
     pub fn blocking(capacity: usize) -> Self {
-        Self { capacity, overflow: Overflow::Block }
+        Self {
+            capacity,
+            overflow: Overflow::Block,
+        }
     }
 
     /// The oldest of `capacity` items gives way.
     pub fn drop_oldest(capacity: usize) -> Self {
-        Self { capacity, overflow: Overflow::DropOldest }
+        Self {
+            capacity,
+            overflow: Overflow::DropOldest,
+        }
     }
 
     /// Only the newest item is worth having: a display.
@@ -50,7 +56,17 @@ impl Queue {
             Overflow::Block => None,
             Overflow::DropOldest => Some(receiver.clone()),
         };
-        (Sender { channel: sender, oldest, shared: Arc::clone(&shared) }, Receiver { channel: receiver, shared })
+        (
+            Sender {
+                channel: sender,
+                oldest,
+                shared: Arc::clone(&shared),
+            },
+            Receiver {
+                channel: receiver,
+                shared,
+            },
+        )
     }
 }
 

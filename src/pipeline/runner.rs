@@ -86,7 +86,10 @@ impl Crew {
                 drop(alive);
                 left
             })
-            .map_err(|error| StartError { name: name.to_owned(), error })?;
+            .map_err(|error| StartError {
+                name: name.to_owned(),
+                error,
+            })?;
         self.threads.push((name.to_owned(), handle));
         Ok(())
     }
@@ -99,7 +102,10 @@ impl Pipeline {
         let shared = Arc::new(Shared::default());
         let controls = Arc::new(Controls::for_stages(self.stages.iter().map(|stage| stage.name())));
         let (alive, ended) = channel::bounded(1);
-        let mut crew = Crew { threads: Vec::new(), alive };
+        let mut crew = Crew {
+            threads: Vec::new(),
+            alive,
+        };
         let clock = self.clock;
         let tap_count = self.taps.len();
 
@@ -128,11 +134,21 @@ impl Pipeline {
         let mut output = Output::Sinks(FanOut::new(sinks, Arc::clone(&clock), Arc::clone(&shared)));
         let mut entry_drops = None;
         for (position, stage) in self.stages.into_iter().enumerate().rev() {
-            let queue = if position == 0 { self.entry } else { Queue::blocking(self.between) };
+            let queue = if position == 0 {
+                self.entry
+            } else {
+                Queue::blocking(self.between)
+            };
             let (sender, input): (Sender<_>, Receiver<_>) = queue.open();
             entry_drops = Some(sender.drop_count());
-            let worker =
-                StageWorker { position, stage, controls: Arc::clone(&controls), input, output, clock: Arc::clone(&clock) };
+            let worker = StageWorker {
+                position,
+                stage,
+                controls: Arc::clone(&controls),
+                input,
+                output,
+                clock: Arc::clone(&clock),
+            };
             crew.start(worker.stage.name(), move || worker.run())?;
             output = Output::Next(sender);
         }
@@ -147,7 +163,13 @@ impl Pipeline {
             shared: Arc::clone(&shared),
         };
         crew.start("source", move || worker.run())?;
-        Ok(RunningPipeline { threads: crew.threads, ended, controls, shared, entry_drops })
+        Ok(RunningPipeline {
+            threads: crew.threads,
+            ended,
+            controls,
+            shared,
+            entry_drops,
+        })
     }
 }
 
@@ -188,13 +210,22 @@ impl RunningPipeline {
         let mut sinks: Vec<(usize, SinkOutcome)> = Vec::new();
         for (name, thread) in self.threads {
             let end_to_end = match thread.join() {
-                Ok(Left::Source { working, failure, stopped, end_to_end }) => {
+                Ok(Left::Source {
+                    working,
+                    failure,
+                    stopped,
+                    end_to_end,
+                }) => {
                     outcome.source_working = working;
                     outcome.source_failure = failure;
                     outcome.stopped = stopped;
                     end_to_end
                 }
-                Ok(Left::Stage { position, outcome, end_to_end }) => {
+                Ok(Left::Stage {
+                    position,
+                    outcome,
+                    end_to_end,
+                }) => {
                     stages.push((position, outcome));
                     end_to_end
                 }

@@ -154,14 +154,24 @@ pub enum RecordingError {
 impl Recording {
     /// A video and nothing else.
     pub fn plain(video: Video) -> Self {
-        Self { video, frame_times: None, trajectory: None, hand_eye: None, camera: None, color: None }
+        Self {
+            video,
+            frame_times: None,
+            trajectory: None,
+            hand_eye: None,
+            camera: None,
+            color: None,
+        }
     }
 
     /// A recording's folder, a video file, or a folder of pictures.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let metadata = std::fs::metadata(path).map_err(|source| match source.kind() {
             std::io::ErrorKind::NotFound => RecordingError::Absent(path.to_owned()),
-            _ => RecordingError::Unreadable { path: path.to_owned(), source },
+            _ => RecordingError::Unreadable {
+                path: path.to_owned(),
+                source,
+            },
         })?;
         if !metadata.is_dir() {
             return Ok(Self::plain(Video::File(path.to_owned())));
@@ -226,29 +236,51 @@ fn trajectory_in(folder: &Path) -> Result<Option<Trajectory>, RecordingError> {
         return Ok(None);
     }
     let own_arm = folder.join("arm.toml");
-    let arm = if own_arm.exists() { Arm::read(&own_arm)? } else { Arm::aesop_3000()? };
+    let arm = if own_arm.exists() {
+        Arm::read(&own_arm)?
+    } else {
+        Arm::aesop_3000()?
+    };
     tracing::info!("{}: turned into poses by the kinematics of {}", joints.display(), arm.name);
     Ok(Some(arm.read_joints(&joints)?))
 }
 
 fn read_frame_times(path: &Path) -> Result<Vec<Timestamp>, RecordingError> {
-    let text = std::fs::read_to_string(path).map_err(|source| RecordingError::Unreadable { path: path.to_owned(), source })?;
-    frame_times::parse(&text).map_err(|(line, fault)| RecordingError::FrameTimes { path: path.to_owned(), line, fault })
+    let text = std::fs::read_to_string(path).map_err(|source| RecordingError::Unreadable {
+        path: path.to_owned(),
+        source,
+    })?;
+    frame_times::parse(&text).map_err(|(line, fault)| RecordingError::FrameTimes {
+        path: path.to_owned(),
+        line,
+        fault,
+    })
 }
 
 fn has_extension(path: &Path, extensions: &[&str]) -> bool {
-    path.extension().and_then(|e| e.to_str()).is_some_and(|e| extensions.contains(&e.to_lowercase().as_str()))
+    path.extension()
+        .and_then(|e| e.to_str())
+        .is_some_and(|e| extensions.contains(&e.to_lowercase().as_str()))
 }
 
 fn video_in(folder: &Path) -> Result<Video, RecordingError> {
-    let unreadable = |source| RecordingError::Unreadable { path: folder.to_owned(), source };
+    let unreadable = |source| RecordingError::Unreadable {
+        path: folder.to_owned(),
+        source,
+    };
     let mut files = Vec::new();
     for entry in std::fs::read_dir(folder).map_err(unreadable)? {
         files.push(entry.map_err(unreadable)?.path());
     }
     files.sort();
-    let videos: Vec<&PathBuf> = files.iter().filter(|file| file.is_file() && has_extension(file, VIDEO_EXTENSIONS)).collect();
-    if let Some(named) = videos.iter().find(|file| file.file_stem().is_some_and(|stem| stem == "video")) {
+    let videos: Vec<&PathBuf> = files
+        .iter()
+        .filter(|file| file.is_file() && has_extension(file, VIDEO_EXTENSIONS))
+        .collect();
+    if let Some(named) = videos
+        .iter()
+        .find(|file| file.file_stem().is_some_and(|stem| stem == "video"))
+    {
         return Ok(Video::File((*named).clone()));
     }
     let frames = folder.join("frames");
@@ -295,7 +327,10 @@ mod tests {
         put("camera.yaml", CAMERA);
         put("frames.csv", "frame,timestamp_s\n0,0\n1,0.04\n");
         put("poses.tum", "# T_base_hand, mm\n0 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n");
-        put("hand_eye.yaml", "unit: mm\ntranslation: {x: 0, y: 0, z: 1}\nrotation: {x: 0, y: 0, z: 0, w: 1}\n");
+        put(
+            "hand_eye.yaml",
+            "unit: mm\ntranslation: {x: 0, y: 0, z: 1}\nrotation: {x: 0, y: 0, z: 0, w: 1}\n",
+        );
         let recording = Recording::open(folder.path()).unwrap();
         assert!(recording.missing().is_empty());
         assert_eq!(recording.video, Video::File(folder.path().join("video.mkv")));
@@ -311,7 +346,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         assert!(matches!(Recording::open(folder.path()), Err(RecordingError::NoVideo(_))));
         std::fs::write(folder.path().join("000000.png"), "x").unwrap();
-        assert_eq!(Recording::open(folder.path()).unwrap().video, Video::Frames(folder.path().to_owned()));
-        assert!(matches!(Recording::open(&folder.path().join("none")), Err(RecordingError::Absent(_))));
+        assert_eq!(
+            Recording::open(folder.path()).unwrap().video,
+            Video::Frames(folder.path().to_owned())
+        );
+        assert!(matches!(
+            Recording::open(&folder.path().join("none")),
+            Err(RecordingError::Absent(_))
+        ));
     }
 }

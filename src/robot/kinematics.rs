@@ -129,9 +129,19 @@ impl Arm {
             return Err(ArmError::Table("expected at least one [[joint]], found none".into()));
         }
         for (joint, number) in arm.joints.iter().zip(1..) {
-            let numbers = [joint.alpha_deg, joint.a, joint.theta_deg, joint.d, joint.limits[0], joint.limits[1]];
+            let numbers = [
+                joint.alpha_deg,
+                joint.a,
+                joint.theta_deg,
+                joint.d,
+                joint.limits[0],
+                joint.limits[1],
+            ];
             if numbers.iter().any(|v| !v.is_finite()) || joint.limits[0] > joint.limits[1] {
-                let message = format!("joint {number} ({}): expected finite numbers and limits = [lowest, highest]", joint.name);
+                let message = format!(
+                    "joint {number} ({}): expected finite numbers and limits = [lowest, highest]",
+                    joint.name
+                );
                 return Err(ArmError::Table(message));
             }
         }
@@ -140,7 +150,10 @@ impl Arm {
 
     /// Read a file like `config/arms/aesop3000.toml`.
     pub fn read(path: &Path) -> Result<Self, ArmError> {
-        let text = std::fs::read_to_string(path).map_err(|source| ArmError::Unreadable { path: path.to_owned(), source })?;
+        let text = std::fs::read_to_string(path).map_err(|source| ArmError::Unreadable {
+            path: path.to_owned(),
+            source,
+        })?;
         Self::from_toml(&text)
     }
 
@@ -158,7 +171,11 @@ impl Arm {
         if values.len() == self.joints.len() {
             Ok(())
         } else {
-            Err(ArmError::Count { arm: self.name.clone(), expected: self.joints.len(), found: values.len() })
+            Err(ArmError::Count {
+                arm: self.name.clone(),
+                expected: self.joints.len(),
+                found: values.len(),
+            })
         }
     }
 
@@ -175,7 +192,15 @@ impl Arm {
             let slack = 0.02 * (highest - lowest);
             if !(lowest - slack..=highest + slack).contains(&found) {
                 let (arm, name) = (self.name.clone(), joint.name.clone());
-                return Err(ArmError::Limit { arm, number, name, lowest, highest, unit, found });
+                return Err(ArmError::Limit {
+                    arm,
+                    number,
+                    name,
+                    lowest,
+                    highest,
+                    unit,
+                    found,
+                });
             }
         }
         Ok(())
@@ -185,7 +210,9 @@ impl Arm {
     pub fn base_from_hand(&self, values: &[f64]) -> Result<Transform<RobotBase, Hand>, ArmError> {
         self.check_count(values)?;
         let links = self.joints.iter().zip(values).map(|(joint, value)| joint.link(*value));
-        Ok(Transform::from_isometry(links.fold(Isometry3::identity(), |chain, link| chain * link)))
+        Ok(Transform::from_isometry(
+            links.fold(Isometry3::identity(), |chain, link| chain * link),
+        ))
     }
 
     /// How the hand moves per unit of each joint, in the base's axes: rows 0–2 the hand's origin (mm), rows 3–5 its rotation (rad).
@@ -209,7 +236,10 @@ impl Arm {
 
     /// Read `joints.csv` (`timestamp_s,q1,…,qn`; mm or rad) and turn every line into a pose.
     pub fn read_joints(&self, path: &Path) -> Result<Trajectory, TrajectoryError> {
-        let text = std::fs::read_to_string(path).map_err(|source| TrajectoryError::Unreadable { path: path.to_owned(), source })?;
+        let text = std::fs::read_to_string(path).map_err(|source| TrajectoryError::Unreadable {
+            path: path.to_owned(),
+            source,
+        })?;
         let mut poses: Vec<TimedPose> = Vec::new();
         for (line_number, line) in (1..).zip(text.lines()) {
             let line = line.trim();
@@ -218,12 +248,17 @@ impl Arm {
                 continue;
             }
             let pose = self.pose_of_line(line).and_then(|pose| match poses.last() {
-                Some(last) if last.stamp >= pose.stamp => {
-                    Err(PoseFault::Backwards { previous_s: last.stamp.seconds(), found_s: pose.stamp.seconds() })
-                }
+                Some(last) if last.stamp >= pose.stamp => Err(PoseFault::Backwards {
+                    previous_s: last.stamp.seconds(),
+                    found_s: pose.stamp.seconds(),
+                }),
                 _ => Ok(pose),
             });
-            poses.push(pose.map_err(|fault| TrajectoryError::Line { path: path.to_owned(), line: line_number, fault })?);
+            poses.push(pose.map_err(|fault| TrajectoryError::Line {
+                path: path.to_owned(),
+                line: line_number,
+                fault,
+            })?);
         }
         Trajectory::new(poses).ok_or_else(|| TrajectoryError::Empty { path: path.to_owned() })
     }
@@ -233,7 +268,10 @@ impl Arm {
         let joints_fault = |e: ArmError| PoseFault::Joints(e.to_string());
         self.check_limits(&values[1..]).map_err(joints_fault)?;
         let base_from_hand = self.base_from_hand(&values[1..]).map_err(joints_fault)?;
-        Ok(TimedPose { stamp: Timestamp::from_seconds(values[0]), base_from_hand })
+        Ok(TimedPose {
+            stamp: Timestamp::from_seconds(values[0]),
+            base_from_hand,
+        })
     }
 }
 
@@ -275,7 +313,10 @@ mod tests {
 
     #[test]
     fn jacobian_is_the_derivative() {
-        for arm in [Arm::aesop_3000().unwrap(), Arm::from_toml(include_str!("../../config/arms/six_axis.toml")).unwrap()] {
+        for arm in [
+            Arm::aesop_3000().unwrap(),
+            Arm::from_toml(include_str!("../../config/arms/six_axis.toml")).unwrap(),
+        ] {
             let q: Vec<f64> = arm.joints().iter().enumerate().map(|(i, _)| 0.3 - 0.1 * i as f64).collect();
             let jacobian = arm.jacobian(&q).unwrap();
             let h = 1e-6;
@@ -298,7 +339,10 @@ mod tests {
     fn faults_are_named() {
         let arm = Arm::aesop_3000().unwrap();
         assert!(arm.base_from_hand(&[0.0; 6]).unwrap_err().to_string().contains("7 joints"));
-        let message = arm.check_limits(&[0.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0]).unwrap_err().to_string();
+        let message = arm
+            .check_limits(&[0.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+            .unwrap_err()
+            .to_string();
         assert!(message.contains("shoulder") && message.contains("157.5"), "{message}");
         assert!(arm.check_limits(&[f64::NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]).is_err());
         assert!(Arm::from_toml("name = \"x\"\nunit = \"cm\"\njoint = []\n").is_err());
@@ -309,10 +353,19 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("joints.csv");
         let arm = Arm::aesop_3000().unwrap();
-        std::fs::write(&path, "timestamp_s,q1,q2,q3,q4,q5,q6,q7\n0.0,0,0,0,0,0,0,0\n0.02,10,0,0,0,0,0,0\n").unwrap();
+        std::fs::write(
+            &path,
+            "timestamp_s,q1,q2,q3,q4,q5,q6,q7\n0.0,0,0,0,0,0,0,0\n0.02,10,0,0,0,0,0,0\n",
+        )
+        .unwrap();
         let trajectory = arm.read_joints(&path).unwrap();
         close(trajectory.poses()[1].base_from_hand.translation(), [791.5, 0.0, -90.0], 1e-9);
         std::fs::write(&path, "0.0,0,0,0,0,0,0,0\n0.02,900,0,0,0,0,0,0\n").unwrap();
-        assert!(arm.read_joints(&path).unwrap_err().to_string().contains("joints.csv, line 2: joint 1 (slide)"));
+        assert!(
+            arm.read_joints(&path)
+                .unwrap_err()
+                .to_string()
+                .contains("joints.csv, line 2: joint 1 (slide)")
+        );
     }
 }

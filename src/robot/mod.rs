@@ -1,4 +1,3 @@
-
 pub mod hand_eye;
 pub mod kinematics;
 pub mod pose_buffer;

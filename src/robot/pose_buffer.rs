@@ -31,7 +31,12 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { max_gap_ms: 200.0, max_extrapolation_ms: 50.0, smoothing_ms: 160.0, kept_ms: 10_000.0 }
+        Self {
+            max_gap_ms: 200.0,
+            max_extrapolation_ms: 50.0,
+            smoothing_ms: 160.0,
+            kept_ms: 10_000.0,
+        }
     }
 }
 
@@ -106,10 +111,18 @@ impl PoseBuffer {
         ];
         for (key, found, lowest, highest) in bounds {
             if !(lowest..=highest).contains(&found) {
-                return Err(SettingsError { key, lowest, highest, found });
+                return Err(SettingsError {
+                    key,
+                    lowest,
+                    highest,
+                    found,
+                });
             }
         }
-        Ok(Self { settings: settings.clone(), samples: std::collections::VecDeque::new() })
+        Ok(Self {
+            settings: settings.clone(),
+            samples: std::collections::VecDeque::new(),
+        })
     }
 
     /// A buffer that holds a whole recorded trajectory.
@@ -291,7 +304,11 @@ impl Sums {
             let normal = Matrix3::new(s[0], s[1], s[2], s[1], s[2], s[3], s[2], s[3], s[4]);
             let inverse = normal.try_inverse().filter(|m| m.iter().all(|v| v.is_finite()))?;
             let row = |i: usize| (0..3).map(|k| self.values[k] * inverse[(i, k)]).sum();
-            return Some(LocalFit { value: row(0), slope: row(1), bend: row(2) });
+            return Some(LocalFit {
+                value: row(0),
+                slope: row(1),
+                bend: row(2),
+            });
         }
         let determinant = s[0] * s[2] - s[1] * s[1];
         if determinant <= 1e-9 * s[0] * s[0] {
@@ -328,7 +345,10 @@ fn residual_scales(residuals: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
         values.sort_unstable_by(f64::total_cmp);
         values.get(values.len() / 2).copied().unwrap_or(0.0)
     };
-    (median(&mut moved[..count]).max(FINEST_SCALE_MM), median(&mut turned[..count]).max(FINEST_SCALE_RAD))
+    (
+        median(&mut moved[..count]).max(FINEST_SCALE_MM),
+        median(&mut turned[..count]).max(FINEST_SCALE_RAD),
+    )
 }
 
 /// No arm is better than this: without a floor, the onset of a motion after perfect rest would count as an outlier.
@@ -365,12 +385,19 @@ mod tests {
     use rand_distr::Distribution as _;
 
     fn interpolating() -> Settings {
-        Settings { smoothing_ms: 0.0, ..Settings::default() }
+        Settings {
+            smoothing_ms: 0.0,
+            ..Settings::default()
+        }
     }
 
     /// A slow sweep as a surgeon's: constant velocity when `bend` is 0.
     fn motion(t: f64, bend: f64) -> Transform<RobotBase, Hand> {
-        let p = Vector3::new(300.0 + 20.0 * t, -40.0 + 8.0 * t + bend * 15.0 * (1.1 * t).sin(), 90.0 - 5.0 * t);
+        let p = Vector3::new(
+            300.0 + 20.0 * t,
+            -40.0 + 8.0 * t + bend * 15.0 * (1.1 * t).sin(),
+            90.0 - 5.0 * t,
+        );
         let turn = UnitQuaternion::from_scaled_axis(Vector3::new(0.1, 0.2, -0.15) * (t + bend * 0.4 * (0.9 * t).sin()));
         Transform::new(turn * UnitQuaternion::from_euler_angles(2.0, 0.3, -1.0), p)
     }
@@ -383,7 +410,10 @@ mod tests {
             let t = i as f64 * 0.02;
             let pose = motion(t, bend);
             let turn = UnitQuaternion::from_scaled_axis(draw(degrees.to_radians()));
-            TimedPose { stamp: Timestamp::from_seconds(t), base_from_hand: Transform::new(turn * pose.rotation(), pose.translation() + draw(mm)) }
+            TimedPose {
+                stamp: Timestamp::from_seconds(t),
+                base_from_hand: Transform::new(turn * pose.rotation(), pose.translation() + draw(mm)),
+            }
         });
         Trajectory::new(poses.collect()).unwrap()
     }
@@ -420,14 +450,20 @@ mod tests {
         // 0.36 of a sample's (0.60 in σ, computed for this window). Interpolating between two leaves 0.5 to 1 of it.
         let sigma = 0.25;
         assert!(mm < 0.70 * sigma && mm < 0.85 * raw_mm, "{mm} against {raw_mm}");
-        assert!(rad < 0.70 * 0.08_f64.to_radians() && rad < 0.85 * raw_rad, "{rad} against {raw_rad}");
+        assert!(
+            rad < 0.70 * 0.08_f64.to_radians() && rad < 0.85 * raw_rad,
+            "{rad} against {raw_rad}"
+        );
     }
 
     #[test]
     fn an_outlier_is_disarmed() {
         let clean = sampled(0.0, 0.02, 0.01, 3);
         let mut poses = clean.poses().to_vec();
-        poses[100].base_from_hand = Transform::new(poses[100].base_from_hand.rotation(), poses[100].base_from_hand.translation().add_scalar(5.0));
+        poses[100].base_from_hand = Transform::new(
+            poses[100].base_from_hand.rotation(),
+            poses[100].base_from_hand.translation().add_scalar(5.0),
+        );
         let buffer = PoseBuffer::from_trajectory(&Trajectory::new(poses).unwrap(), &Settings::default()).unwrap();
         for t in [1.985, 2.001, 2.015] {
             let pose = buffer.pose_at(Timestamp::from_seconds(t)).unwrap();
@@ -446,7 +482,10 @@ mod tests {
 
     #[test]
     fn misses_are_told_apart() {
-        let at = |ms: f64| TimedPose { stamp: Timestamp(0) + Span::from_milliseconds(ms), base_from_hand: Transform::identity() };
+        let at = |ms: f64| TimedPose {
+            stamp: Timestamp(0) + Span::from_milliseconds(ms),
+            base_from_hand: Transform::identity(),
+        };
         let look = |buffer: &PoseBuffer, ms: f64| buffer.pose_at(Timestamp(0) + Span::from_milliseconds(ms));
         let mut buffer = PoseBuffer::new(&Settings::default()).unwrap();
         assert_eq!(look(&buffer, 0.0).unwrap_err(), PoseLookupError::Empty);
@@ -467,14 +506,21 @@ mod tests {
     #[test]
     fn one_sample_serves_its_neighbourhood() {
         let mut buffer = PoseBuffer::new(&Settings::default()).unwrap();
-        buffer.push(TimedPose { stamp: Timestamp(0), base_from_hand: Transform::identity() });
+        buffer.push(TimedPose {
+            stamp: Timestamp(0),
+            base_from_hand: Transform::identity(),
+        });
         assert_eq!(buffer.pose_at(Timestamp(0)).unwrap().origin, Origin::Measured);
         assert_eq!(buffer.pose_at(Timestamp(10_000_000)).unwrap().origin, Origin::Predicted);
     }
 
     #[test]
     fn settings_are_checked() {
-        let error = PoseBuffer::new(&Settings { max_gap_ms: f64::NAN, ..Settings::default() }).unwrap_err();
+        let error = PoseBuffer::new(&Settings {
+            max_gap_ms: f64::NAN,
+            ..Settings::default()
+        })
+        .unwrap_err();
         assert!(error.to_string().contains("max_gap_ms"));
     }
 }

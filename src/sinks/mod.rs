@@ -1,6 +1,6 @@
 //! Where frames go.
 
 pub mod mask;
+pub mod report;
 pub mod side_by_side;
 pub mod video;
-pub mod report;

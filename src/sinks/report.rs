@@ -54,7 +54,10 @@ pub struct FrameRecord {
 impl FrameRecord {
     /// What the frame itself tells.
     pub fn of(frame: &Frame) -> Self {
-        let mut mask = MaskShares { untouched: 1.0, ..MaskShares::default() };
+        let mut mask = MaskShares {
+            untouched: 1.0,
+            ..MaskShares::default()
+        };
         let mut median_confidence = None;
         if let Some(provenance) = &frame.provenance {
             let codes = provenance.code.pixels();
@@ -86,7 +89,12 @@ impl FrameRecord {
             pose_correction_px: aligned.map(|alignment| f64::from(alignment.correction_px)),
             pose: frame.pose_origin,
             scene_cut: frame.scene_cut,
-            bypassed: frame.timings.iter().filter(|timing| timing.bypassed).map(|timing| timing.stage).collect(),
+            bypassed: frame
+                .timings
+                .iter()
+                .filter(|timing| timing.bypassed)
+                .map(|timing| timing.stage)
+                .collect(),
         }
     }
 }
@@ -152,16 +160,37 @@ mod tests {
     #[test]
     fn shares_and_confidence_are_counted() {
         let mut frame = Frame::new(FrameId(7), Timestamp(0), Timestamp(0), Pool::new(1).take(10, 10));
-        assert_eq!(FrameRecord::of(&frame).mask, MaskShares { untouched: 1.0, ..MaskShares::default() });
+        assert_eq!(
+            FrameRecord::of(&frame).mask,
+            MaskShares {
+                untouched: 1.0,
+                ..MaskShares::default()
+            }
+        );
         let (mut code, mut confidence) = (Pool::new(1).take(10, 10), Pool::new(1).take(10, 10));
         code.pixels_mut()[..20].fill(provenance_code::LEFT);
         code.pixels_mut()[20..50].fill(provenance_code::LIGHT_FIELD);
         confidence.pixels_mut()[20..40].fill(204);
-        frame.provenance = Some(Provenance { code, view: Pool::new(1).take(10, 10), confidence });
+        frame.provenance = Some(Provenance {
+            code,
+            view: Pool::new(1).take(10, 10),
+            confidence,
+        });
         let record = FrameRecord::of(&frame);
-        assert_eq!(record.mask, MaskShares { untouched: 0.5, left: 0.2, light_field: 0.3, ..MaskShares::default() });
+        assert_eq!(
+            record.mask,
+            MaskShares {
+                untouched: 0.5,
+                left: 0.2,
+                light_field: 0.3,
+                ..MaskShares::default()
+            }
+        );
         assert_eq!((record.median_confidence, record.frame), (Some(0.8), 7));
         let json = serde_json::to_value(&record).unwrap();
-        assert_eq!((json["mask"]["255"].as_f64(), json["pose"].as_str()), (Some(0.3), Some("missing")));
+        assert_eq!(
+            (json["mask"]["255"].as_f64(), json["pose"].as_str()),
+            (Some(0.3), Some("missing"))
+        );
     }
 }

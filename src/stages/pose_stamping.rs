@@ -24,7 +24,12 @@ impl PoseStamping {
     /// With the time offset of the hand-eye file, or none.
     pub fn new(poses: PoseBuffer, hand_eye: HandEye) -> Self {
         let time_offset = hand_eye.time_offset.unwrap_or_default();
-        Self { poses, hand_eye, time_offset, world_from_base: Transform::identity() }
+        Self {
+            poses,
+            hand_eye,
+            time_offset,
+            world_from_base: Transform::identity(),
+        }
     }
 
     /// With another time offset, as estimated from the pictures.
@@ -72,13 +77,19 @@ mod tests {
 
     /// The hand turns about the base's z axis at 0.5 rad/s and slides along x at 10 mm/s.
     fn hand_at(t: f64) -> Transform<RobotBase, crate::geometry::space::Hand> {
-        Transform::new(UnitQuaternion::from_scaled_axis(Vector3::z() * (0.5 * t)), Vector3::new(10.0 * t, 0.0, 0.0))
+        Transform::new(
+            UnitQuaternion::from_scaled_axis(Vector3::z() * (0.5 * t)),
+            Vector3::new(10.0 * t, 0.0, 0.0),
+        )
     }
 
     fn stamped(at_s: f64, offset_ms: f64) -> Frame {
         let poses = (0..100).map(|i| {
             let t = 0.02 * i as f64;
-            TimedPose { stamp: Timestamp::from_seconds(t), base_from_hand: hand_at(t) }
+            TimedPose {
+                stamp: Timestamp::from_seconds(t),
+                base_from_hand: hand_at(t),
+            }
         });
         let trajectory = Trajectory::new(poses.collect()).unwrap();
         let buffer = PoseBuffer::from_trajectory(&trajectory, &Settings::default()).unwrap();
@@ -95,7 +106,8 @@ mod tests {
         // A stamp that is 40 ms late gets −40 ms added: the camera's instant 1 s is the arm's 1.04 s.
         let frame = stamped(1.0, -40.0);
         let camera = frame.world_from_camera.unwrap();
-        let truth = hand_at(1.04) * Transform::<_, crate::geometry::space::Camera>::new(UnitQuaternion::identity(), Vector3::new(300.0, 0.0, 5.0));
+        let truth = hand_at(1.04)
+            * Transform::<_, crate::geometry::space::Camera>::new(UnitQuaternion::identity(), Vector3::new(300.0, 0.0, 5.0));
         assert!((camera.translation() - truth.translation()).norm() < 1e-6);
         assert_eq!(frame.pose_origin, PoseOrigin::Measured);
     }

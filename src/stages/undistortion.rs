@@ -32,7 +32,9 @@ pub enum UndistortionError {
     #[error("undistort.balance: expected a number from 0 to 1, found {0}")]
     Balance(f64),
     /// No pinhole shows the border of the picture.
-    #[error("undistort.balance: the border of the picture lies outside the lens's field; leave balance out to keep the camera matrix")]
+    #[error(
+        "undistort.balance: the border of the picture lies outside the lens's field; leave balance out to keep the camera matrix"
+    )]
     Border,
     /// No table.
     #[error("the camera model cannot be turned into a table: {0}")]
@@ -76,7 +78,13 @@ impl Undistortion {
         };
         let table = undistortion::table(camera, &pinhole)?;
         let output = Image::filled(pinhole.width, pinhole.height, [0; 3]);
-        Ok(Self { table, interpolation: settings.interpolation, pinhole: Arc::new(pinhole), output, field: None })
+        Ok(Self {
+            table,
+            interpolation: settings.interpolation,
+            pinhole: Arc::new(pinhole),
+            output,
+            field: None,
+        })
     }
 
     /// The camera that explains the output.
@@ -104,13 +112,25 @@ impl FieldPatch {
                 let (left, top) = (sx.floor().max(0.0) as usize, sy.floor().max(0.0) as usize);
                 let (right, bottom) = ((left + 1).min(source_width - 1), (top + 1).min(source_height - 1));
                 let corners = [(left, top), (right, top), (left, bottom), (right, bottom)];
-                if corners.iter().any(|(cx, cy)| input.at((*cx).min(right), (*cy).min(bottom)) == 0) {
+                if corners
+                    .iter()
+                    .any(|(cx, cy)| input.at((*cx).min(right), (*cy).min(bottom)) == 0)
+                {
                     let near = |s: f64, last: usize| ((s + 0.5).floor().max(0.0) as usize).min(last);
-                    rim.push((index as u32, (near(sy, source_height - 1) * source_width + near(sx, source_width - 1)) as u32));
+                    rim.push((
+                        index as u32,
+                        (near(sy, source_height - 1) * source_width + near(sx, source_width - 1)) as u32,
+                    ));
                 }
             }
         }
-        Ok(Self { input: Arc::clone(input), output: Arc::new(output), rim, kept, black })
+        Ok(Self {
+            input: Arc::clone(input),
+            output: Arc::new(output),
+            rim,
+            kept,
+            black,
+        })
     }
 
     fn apply(&self, source: &Image<Rgb8>, out: &mut Image<Rgb8>) {
@@ -142,7 +162,9 @@ impl Stage for Undistortion {
 
     fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
         let fail = |e: RemapError| StageError(format!("undistortion: {e}"));
-        self.table.remap_rgb(&frame.image, &mut self.output, self.interpolation).map_err(fail)?;
+        self.table
+            .remap_rgb(&frame.image, &mut self.output, self.interpolation)
+            .map_err(fail)?;
         match &frame.field_of_view {
             Some(field) if field.size() == frame.image.size() => {
                 if !self.field.as_ref().is_some_and(|patch| Arc::ptr_eq(&patch.input, field)) {
@@ -171,8 +193,21 @@ mod tests {
     use crate::time::Timestamp;
 
     fn camera() -> CameraModel {
-        let intrinsics = Intrinsics { fx: 110.0, fy: 110.0, cx: 79.5, cy: 59.5 };
-        CameraModel { width: 160, height: 120, intrinsics, distortion: Distortion::BrownConrady { k: [-0.3, 0.06, 0.0, 0.0, 0.0, 0.0], p: [0.0; 2] } }
+        let intrinsics = Intrinsics {
+            fx: 110.0,
+            fy: 110.0,
+            cx: 79.5,
+            cy: 59.5,
+        };
+        CameraModel {
+            width: 160,
+            height: 120,
+            intrinsics,
+            distortion: Distortion::BrownConrady {
+                k: [-0.3, 0.06, 0.0, 0.0, 0.0, 0.0],
+                p: [0.0; 2],
+            },
+        }
     }
 
     fn frame(image: &Image<Rgb8>, field: Option<Arc<Mask>>) -> Frame {
@@ -238,9 +273,18 @@ mod tests {
 
     #[test]
     fn settings_are_checked() {
-        let settings = |balance| Settings { balance: Some(balance), ..Settings::default() };
-        assert!(matches!(Undistortion::new(&settings(1.5), &camera()), Err(UndistortionError::Balance(_))));
-        assert!(matches!(Undistortion::new(&settings(f64::NAN), &camera()), Err(UndistortionError::Balance(_))));
+        let settings = |balance| Settings {
+            balance: Some(balance),
+            ..Settings::default()
+        };
+        assert!(matches!(
+            Undistortion::new(&settings(1.5), &camera()),
+            Err(UndistortionError::Balance(_))
+        ));
+        assert!(matches!(
+            Undistortion::new(&settings(f64::NAN), &camera()),
+            Err(UndistortionError::Balance(_))
+        ));
         assert!(Undistortion::new(&settings(0.5), &camera()).is_ok());
     }
 }

@@ -35,19 +35,33 @@ pub fn streaks(seed: u64, frame: u64, per_frame: f64, size: (usize, usize)) -> V
         let count = (per_frame / 2.0 * random.random_range(0.4..1.6)).round() as usize;
         for _ in 0..count {
             let life = random.random_range(1..=LONGEST_LIFE);
-            let start = [random.random_range(0.0..size.0 as f64), random.random_range(0.0..size.1 as f64)];
+            let start = [
+                random.random_range(0.0..size.0 as f64),
+                random.random_range(0.0..size.1 as f64),
+            ];
             let heading = random.random_range(0.0..std::f64::consts::TAU);
             let length: f64 = random.random_range(2.0..15.0);
             let radius_px = random.random_range(0.8..2.2);
             let bright = random.random_range(0.0..1.0) < 0.75;
-            let light = if bright { random.random_range(0.45..1.1) } else { random.random_range(0.0..0.04) } as f32;
+            let light = if bright {
+                random.random_range(0.45..1.1)
+            } else {
+                random.random_range(0.0..0.04)
+            } as f32;
             let cover = random.random_range(0.55..0.97) as f32;
             if age < life {
                 let along = [heading.cos(), heading.sin()];
                 // It moves on by more than its own length: exposure is shorter than the frame.
                 let gone = age as f64 * length * 1.8;
                 let at = [start[0] + along[0] * gone, start[1] + along[1] * gone];
-                seen.push(Streak { at, along, half_length_px: 0.5 * length, radius_px, light, cover });
+                seen.push(Streak {
+                    at,
+                    along,
+                    half_length_px: 0.5 * length,
+                    radius_px,
+                    light,
+                    cover,
+                });
             }
         }
     }
@@ -91,7 +105,11 @@ pub const AIRLIGHT: [f32; 3] = [0.36, 0.37, 0.39];
 impl Smoke {
     /// `peak` is the optical depth of the thickest smoke.
     pub fn new(seed: u64, peak: f64, duration_s: f64) -> Self {
-        Self { noise: Noise::new(seed ^ 0x50C3), peak, duration_s: duration_s.max(0.1) }
+        Self {
+            noise: Noise::new(seed ^ 0x50C3),
+            peak,
+            duration_s: duration_s.max(0.1),
+        }
     }
 
     /// Transmission t at (x, y) in widths of the picture from its centre.
@@ -132,7 +150,10 @@ mod tests {
         let smoke = Smoke::new(3, 1.2, 10.0);
         assert_eq!(smoke.transmission(0.5, 0.0, 0.0), 1.0);
         let mean = |t: f64| {
-            (0..100).map(|i| smoke.transmission(t, f64::from(i % 10) * 0.09 - 0.45, f64::from(i / 10) * 0.05 - 0.25)).sum::<f64>() / 100.0
+            (0..100)
+                .map(|i| smoke.transmission(t, f64::from(i % 10) * 0.09 - 0.45, f64::from(i / 10) * 0.05 - 0.25))
+                .sum::<f64>()
+                / 100.0
         };
         assert!(mean(4.5) < 0.75 && mean(9.9) > mean(4.5) + 0.1);
     }

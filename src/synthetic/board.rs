@@ -38,7 +38,11 @@ pub struct Corner {
 pub fn waved(seconds: f64) -> Transform<Camera, Board> {
     let s = seconds * 1.9;
     let tilt = UnitQuaternion::from_euler_angles(0.52 * (1.13 * s).sin(), 0.55 * (0.87 * s + 1.0).sin(), 0.5 * (0.41 * s).sin());
-    let centre = Vector3::new(13.0 * (0.71 * s + 0.5).sin(), 7.0 * (0.93 * s).cos(), 76.0 + 16.0 * (0.53 * s + 2.0).sin());
+    let centre = Vector3::new(
+        13.0 * (0.71 * s + 0.5).sin(),
+        7.0 * (0.93 * s).cos(),
+        76.0 + 16.0 * (0.53 * s + 2.0).sin(),
+    );
     Transform::new(tilt, centre - tilt * middle())
 }
 
@@ -63,7 +67,11 @@ fn station_pose(number: f64) -> Transform<Board, Camera> {
 }
 
 fn middle() -> Vector3<f64> {
-    Vector3::new((CORNERS[0] - 1) as f64 * SQUARE_MM / 2.0, (CORNERS[1] - 1) as f64 * SQUARE_MM / 2.0, 0.0)
+    Vector3::new(
+        (CORNERS[0] - 1) as f64 * SQUARE_MM / 2.0,
+        (CORNERS[1] - 1) as f64 * SQUARE_MM / 2.0,
+        0.0,
+    )
 }
 
 /// All inner corners, row by row, as the camera sees them; `None` if one of them is not in the picture.
@@ -71,7 +79,9 @@ pub fn corners(renderer: &Renderer, camera_from_board: &Transform<Camera, Board>
     (0..CORNERS[0] * CORNERS[1])
         .map(|i| {
             let board = [(i % CORNERS[0]) as f64 * SQUARE_MM, (i / CORNERS[0]) as f64 * SQUARE_MM];
-            let pixel = renderer.camera().project(*camera_from_board * Point::<Board>::new(board[0], board[1], 0.0))?;
+            let pixel = renderer
+                .camera()
+                .project(*camera_from_board * Point::<Board>::new(board[0], board[1], 0.0))?;
             renderer.in_field(pixel).then_some(Corner { board, pixel })
         })
         .collect()
@@ -154,7 +164,10 @@ mod tests {
     fn the_four_squares_round_a_corner_alternate() {
         let at = |x: f64, y: f64| board_albedo(x, y, 0.1);
         let (a, b, c, d) = (at(-1.0, -1.0), at(1.0, -1.0), at(-1.0, 1.0), at(1.0, 1.0));
-        assert!((a - d).abs() < 1e-9 && (b - c).abs() < 1e-9 && (a - b).abs() > 0.5, "{a} {b} {c} {d}");
+        assert!(
+            (a - d).abs() < 1e-9 && (b - c).abs() < 1e-9 && (a - b).abs() > 0.5,
+            "{a} {b} {c} {d}"
+        );
         assert!((at(0.0, 0.0) - (BLACK + WHITE) / 2.0).abs() < 1e-9);
         assert_eq!(at(100.0, 0.0), TABLE);
         assert_eq!(at(-6.0, 3.0), WHITE);

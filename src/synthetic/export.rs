@@ -52,12 +52,18 @@ pub enum ExportError {
 
 /// Make a folder and its parents.
 pub fn make_folder(path: &Path) -> Result<(), ExportError> {
-    fs::create_dir_all(path).map_err(|source| ExportError::Io { path: path.to_owned(), source })
+    fs::create_dir_all(path).map_err(|source| ExportError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Write a text file.
 pub fn write_text(path: &Path, text: &str) -> Result<(), ExportError> {
-    fs::write(path, text).map_err(|source| ExportError::Io { path: path.to_owned(), source })
+    fs::write(path, text).map_err(|source| ExportError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Write an 8-bit color PNG, fast.
@@ -80,8 +86,14 @@ fn write_png(path: &Path, bytes: &[u8], size: (usize, usize), color: image::Exte
     let mut file = Vec::with_capacity(bytes.len() / 2);
     PngEncoder::new_with_quality(&mut file, CompressionType::Fast, FilterType::Up)
         .write_image(bytes, size.0 as u32, size.1 as u32, color)
-        .map_err(|source| ExportError::Encode { path: path.to_owned(), source })?;
-    fs::write(path, file).map_err(|source| ExportError::Io { path: path.to_owned(), source })
+        .map_err(|source| ExportError::Encode {
+            path: path.to_owned(),
+            source,
+        })?;
+    fs::write(path, file).map_err(|source| ExportError::Io {
+        path: path.to_owned(),
+        source,
+    })
 }
 
 /// Write poses, mm; `transform` as in `T_base_hand`.

@@ -33,7 +33,11 @@ const TROCAR_MM: [f64; 3] = [88.0, 46.0, 96.0];
 pub fn grasper(seconds: f64) -> [Rod; 3] {
     let trocar = Vector3::from(TROCAR_MM);
     let phase = 0.9 * seconds;
-    let tip = Vector3::new(8.0 + 22.0 * (phase + 0.3).cos(), 8.0 + 11.0 * (0.8 * phase + 0.5).sin(), 13.5 + 2.0 * (1.3 * phase).sin());
+    let tip = Vector3::new(
+        8.0 + 22.0 * (phase + 0.3).cos(),
+        8.0 + 11.0 * (0.8 * phase + 0.5).sin(),
+        13.5 + 2.0 * (1.3 * phase).sin(),
+    );
     let along = (tip - trocar).normalize();
     let side = along.cross(&Vector3::z()).normalize();
     let opening = 0.10 + 0.14 * (0.5 + 0.5 * (1.7 * phase).sin());
@@ -44,7 +48,16 @@ pub fn grasper(seconds: f64) -> [Rod; 3] {
         radius_mm: 1.15,
         finish: 1.0,
     };
-    [Rod { from: trocar - along * 20.0, to: hinge, radius_mm: 2.5, finish: 0.45 }, jaw(1.0), jaw(-1.0)]
+    [
+        Rod {
+            from: trocar - along * 20.0,
+            to: hinge,
+            radius_mm: 2.5,
+            finish: 0.45,
+        },
+        jaw(1.0),
+        jaw(-1.0),
+    ]
 }
 
 /// The nearest meeting of the ray with any rod.
@@ -60,8 +73,16 @@ pub fn instrument_hit(rods: &[Rod], origin: Vector3<f64>, direction: Vector3<f64
             let normal = (at - rod.from - axis * along) / rod.radius_mm;
             // Turned rings on the shaft's end, serrations on the jaws.
             let from_end_mm = (1.0 - along) * axis.norm();
-            let groove = if from_end_mm < 14.0 { 0.78 + 0.22 * (from_end_mm * 4.2).sin() } else { 1.0 };
-            nearest = Some(InstrumentHit { t, normal: normal.normalize(), finish: rod.finish * groove });
+            let groove = if from_end_mm < 14.0 {
+                0.78 + 0.22 * (from_end_mm * 4.2).sin()
+            } else {
+                1.0
+            };
+            nearest = Some(InstrumentHit {
+                t,
+                normal: normal.normalize(),
+                finish: rod.finish * groove,
+            });
         }
     }
     nearest
@@ -121,7 +142,11 @@ fn distance_of_segments(p: Vector3<f64>, q: Vector3<f64>, r: Vector3<f64>, s: Ve
     let (a, e, f) = (d1.norm_squared(), d2.norm_squared(), d2.dot(&between));
     let (b, c) = (d1.dot(&d2), d1.dot(&between));
     let parallel = a * e - b * b;
-    let mut u = if parallel > 1e-12 { ((b * f - c * e) / parallel).clamp(0.0, 1.0) } else { 0.0 };
+    let mut u = if parallel > 1e-12 {
+        ((b * f - c * e) / parallel).clamp(0.0, 1.0)
+    } else {
+        0.0
+    };
     let mut v = (b * u + f) / e;
     if v < 0.0 {
         v = 0.0;
@@ -139,7 +164,12 @@ mod tests {
 
     #[test]
     fn a_ray_meets_the_shaft_at_its_radius() {
-        let rod = Rod { from: Vector3::new(-50.0, 0.0, 0.0), to: Vector3::new(50.0, 0.0, 0.0), radius_mm: 2.5, finish: 1.0 };
+        let rod = Rod {
+            from: Vector3::new(-50.0, 0.0, 0.0),
+            to: Vector3::new(50.0, 0.0, 0.0),
+            radius_mm: 2.5,
+            finish: 1.0,
+        };
         let hit = instrument_hit(&[rod], Vector3::new(-10.0, 0.0, 60.0), Vector3::new(0.1, 0.0, -1.0)).unwrap();
         assert!((hit.t - 57.5).abs() < 1e-9);
         assert!((hit.normal - Vector3::z()).norm() < 1e-9);
@@ -151,7 +181,12 @@ mod tests {
 
     #[test]
     fn the_shadow_lies_behind_the_rod_only() {
-        let rod = Rod { from: Vector3::new(-50.0, 0.0, 20.0), to: Vector3::new(50.0, 0.0, 20.0), radius_mm: 2.5, finish: 1.0 };
+        let rod = Rod {
+            from: Vector3::new(-50.0, 0.0, 20.0),
+            to: Vector3::new(50.0, 0.0, 20.0),
+            radius_mm: 2.5,
+            finish: 1.0,
+        };
         let lamp = Vector3::new(0.0, 0.0, 80.0);
         assert_eq!(unshaded(&[rod], Vector3::zeros(), lamp), 0.0);
         assert_eq!(unshaded(&[rod], Vector3::new(0.0, 9.0, 0.0), lamp), 1.0);

@@ -37,7 +37,13 @@ impl MaterialMap {
             .into_par_iter()
             .map(|i| texel(&grid, i % grid.columns, i / grid.columns))
             .collect();
-        Self { pitch_mm, origin: grid.origin, columns: grid.columns, rows: grid.rows, texels }
+        Self {
+            pitch_mm,
+            origin: grid.origin,
+            columns: grid.columns,
+            rows: grid.rows,
+            texels,
+        }
     }
 
     /// The material at (x, y), mm.
@@ -85,6 +91,9 @@ impl MaterialGrid {
 
     /// Place of a texel, mm.
     pub fn place(&self, column: usize, row: usize) -> (f64, f64) {
-        (self.origin[0] + column as f64 * self.pitch_mm, self.origin[1] + row as f64 * self.pitch_mm)
+        (
+            self.origin[0] + column as f64 * self.pitch_mm,
+            self.origin[1] + row as f64 * self.pitch_mm,
+        )
     }
 }

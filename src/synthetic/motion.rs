@@ -38,8 +38,21 @@ impl Motion {
         let shift = Vector3::new(0.15, -0.85, 0.5) * breath + Vector3::new(0.2, 0.1, 0.97) * beat;
         // 1 % of stretch a mm along the push, tissue being incompressible, half of that back across.
         let stretch = 0.0035 * breath;
-        let linear = Matrix3::new(1.0, 0.3 * stretch, 0.0, 0.0, 1.0 - stretch, 0.0, 0.0, 0.15 * stretch, 1.0 + 0.5 * stretch);
-        RestFromMoved { linear, offset: -(linear * shift) }
+        let linear = Matrix3::new(
+            1.0,
+            0.3 * stretch,
+            0.0,
+            0.0,
+            1.0 - stretch,
+            0.0,
+            0.0,
+            0.15 * stretch,
+            1.0 + 0.5 * stretch,
+        );
+        RestFromMoved {
+            linear,
+            offset: -(linear * shift),
+        }
     }
 }
 
@@ -47,7 +60,11 @@ impl Motion {
 pub fn breath_share(seconds: f64) -> f64 {
     let t = seconds.rem_euclid(BREATH_S);
     let ramp = |t: f64| 0.5 - 0.5 * (std::f64::consts::PI * t.clamp(0.0, 1.0)).cos();
-    if t < BREATH_IN_S { ramp(t / BREATH_IN_S) } else { 1.0 - ramp((t - BREATH_IN_S) / BREATH_OUT_S) }
+    if t < BREATH_IN_S {
+        ramp(t / BREATH_IN_S)
+    } else {
+        1.0 - ramp((t - BREATH_IN_S) / BREATH_OUT_S)
+    }
 }
 
 fn beat_share(seconds: f64) -> f64 {

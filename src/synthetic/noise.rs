@@ -14,7 +14,9 @@ pub struct Noise {
 impl Noise {
     /// The field of a seed.
     pub fn new(seed: u64) -> Self {
-        Self { seed: hash_u64(seed) as u32 }
+        Self {
+            seed: hash_u64(seed) as u32,
+        }
     }
 
     /// One octave at `p`.
@@ -26,8 +28,16 @@ impl Noise {
             let hash = self.hash(ix.wrapping_add(dx), iy.wrapping_add(dy), iz.wrapping_add(dz));
             slope(hash, x - f64::from(dx), y - f64::from(dy), z - f64::from(dz))
         };
-        let near = lerp(v, lerp(u, corner(0, 0, 0), corner(1, 0, 0)), lerp(u, corner(0, 1, 0), corner(1, 1, 0)));
-        let far = lerp(v, lerp(u, corner(0, 0, 1), corner(1, 0, 1)), lerp(u, corner(0, 1, 1), corner(1, 1, 1)));
+        let near = lerp(
+            v,
+            lerp(u, corner(0, 0, 0), corner(1, 0, 0)),
+            lerp(u, corner(0, 1, 0), corner(1, 1, 0)),
+        );
+        let far = lerp(
+            v,
+            lerp(u, corner(0, 0, 1), corner(1, 0, 1)),
+            lerp(u, corner(0, 1, 1), corner(1, 1, 1)),
+        );
         lerp(w, near, far)
     }
 
@@ -45,8 +55,12 @@ impl Noise {
 
     fn hash(&self, x: i32, y: i32, z: i32) -> u32 {
         let mut h = self.seed ^ (x as u32).wrapping_mul(0x9E37_79B1);
-        h = (h ^ (h >> 15)).wrapping_add((y as u32).wrapping_mul(0x85EB_CA77)).wrapping_mul(0x2C1B_3C6D);
-        h = (h ^ (h >> 13)).wrapping_add((z as u32).wrapping_mul(0xC2B2_AE3D)).wrapping_mul(0x297A_2D39);
+        h = (h ^ (h >> 15))
+            .wrapping_add((y as u32).wrapping_mul(0x85EB_CA77))
+            .wrapping_mul(0x2C1B_3C6D);
+        h = (h ^ (h >> 13))
+            .wrapping_add((z as u32).wrapping_mul(0xC2B2_AE3D))
+            .wrapping_mul(0x297A_2D39);
         h ^ (h >> 16)
     }
 }

@@ -46,7 +46,12 @@ pub struct Height {
 
 impl Relief {
     /// Sample `height` over ±`half_width_mm` × ±`half_height_mm` around the origin.
-    pub fn from_function(half_width_mm: f64, half_height_mm: f64, pitch_mm: f64, height: impl Fn(f64, f64) -> f64 + Sync) -> Self {
+    pub fn from_function(
+        half_width_mm: f64,
+        half_height_mm: f64,
+        pitch_mm: f64,
+        height: impl Fn(f64, f64) -> f64 + Sync,
+    ) -> Self {
         use rayon::prelude::*;
         let columns = (2.0 * half_width_mm / pitch_mm).ceil() as usize + 3;
         let rows = (2.0 * half_height_mm / pitch_mm).ceil() as usize + 3;
@@ -103,7 +108,11 @@ impl Relief {
             dy += dv[k] * along;
             dx += wv[k] * (a * du[0] + b * du[1] + c * du[2]);
         }
-        Height { z, dx: dx / self.pitch_mm, dy: dy / self.pitch_mm }
+        Height {
+            z,
+            dx: dx / self.pitch_mm,
+            dy: dy / self.pitch_mm,
+        }
     }
 
     /// Where the ray `origin + t·direction` first meets the surface from above; t in units of `direction`.

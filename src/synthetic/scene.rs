@@ -34,14 +34,12 @@ impl World3d {
     /// The organs of `seed` before a scope with two lamps; the finest texture is made for pictures `width` px wide.
     pub fn new(anatomy: Anatomy, seed: u64, width: usize) -> Self {
         let texel_mm = (0.1 * 960.0 / width.max(1) as f64).clamp(0.06, 0.30);
-        let lamp = |x: f64, y: f64, intensity: f64| {
-            Lamp {
-                at: Vector3::new(x, y, -0.5),
-                axis: Vector3::new(-0.02 * x.signum(), 0.01, 1.0).normalize(),
-                intensity,
-                colour: [1.0, 0.985, 0.955],
-                exponent: 5,
-            }
+        let lamp = |x: f64, y: f64, intensity: f64| Lamp {
+            at: Vector3::new(x, y, -0.5),
+            axis: Vector3::new(-0.02 * x.signum(), 0.01, 1.0).normalize(),
+            intensity,
+            colour: [1.0, 0.985, 0.955],
+            exponent: 5,
         };
         Self {
             organs: Organs::new(anatomy, seed, texel_mm),
@@ -62,7 +60,15 @@ pub fn laparoscope(width: usize, height: usize) -> CameraModel {
     CameraModel {
         width,
         height,
-        intrinsics: Intrinsics { fx: 0.920 * w, fy: 0.9215 * w, cx: 0.5 * w - 0.5 + 0.0057 * w, cy: 0.5 * h - 0.5 - 0.0041 * w },
-        distortion: Distortion::BrownConrady { k: [-0.24, 0.085, -0.012, 0.0, 0.0, 0.0], p: [0.0006, -0.0004] },
+        intrinsics: Intrinsics {
+            fx: 0.920 * w,
+            fy: 0.9215 * w,
+            cx: 0.5 * w - 0.5 + 0.0057 * w,
+            cy: 0.5 * h - 0.5 - 0.0041 * w,
+        },
+        distortion: Distortion::BrownConrady {
+            k: [-0.24, 0.085, -0.012, 0.0, 0.0, 0.0],
+            p: [0.0006, -0.0004],
+        },
     }
 }

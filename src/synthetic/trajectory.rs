@@ -51,7 +51,11 @@ const SURVEY_ROW_MM: f64 = 62.0;
 impl Trajectory {
     /// A path that lasts `duration_s`.
     pub fn new(course: Course, duration_s: f64, world_from_organs: Transform<World, Scene>) -> Self {
-        Self { course, duration_s: duration_s.max(0.1), world_from_organs }
+        Self {
+            course,
+            duration_s: duration_s.max(0.1),
+            world_from_organs,
+        }
     }
 
     /// Camera pose at `seconds`.
@@ -76,7 +80,12 @@ impl Trajectory {
 
     fn shaft(&self, seconds: f64) -> Shaft {
         match self.course {
-            Course::Still => Shaft { tilt_x: 0.0, tilt_y: 0.0, distance_mm: 72.0, roll: 0.02 },
+            Course::Still => Shaft {
+                tilt_x: 0.0,
+                tilt_y: 0.0,
+                distance_mm: 72.0,
+                roll: 0.02,
+            },
             Course::Survey => {
                 // Rows from side to side while the other tilt goes once through; as many rows as the time allows.
                 let rows = (self.duration_s * SURVEY_MM_PER_S / SURVEY_ROW_MM).max(0.9);

@@ -47,7 +47,12 @@ pub fn vessel_coverage(grid: &MaterialGrid, roots: &[Root], seed: u64) -> Vec<f3
             let radius_mm = branch.radius_mm * 0.92 * part.cbrt();
             if radius_mm > THINNEST_MM {
                 let turn = side * random.random_range(0.25..0.8);
-                growing.push(Root { at, heading: heading + turn, radius_mm, length_mm: branch.length_mm * 0.85 });
+                growing.push(Root {
+                    at,
+                    heading: heading + turn,
+                    radius_mm,
+                    length_mm: branch.length_mm * 0.85,
+                });
             }
         }
     }

@@ -13,6 +13,11 @@ use crate::light_field::error::LightFieldError;
 use crate::light_field::view::{SparsePoint, View};
 use crate::progress::Progress;
 
+/// Two depths of the first pass agree within this share; the second pass asks for more.
+const FIRST_AGREEMENT: f32 = 0.015;
+/// Depth around a guess needs a matching cost below this (correlation above one half).
+const GUESS_COST: f32 = 0.5;
+
 /// How depth is searched.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -36,7 +41,7 @@ pub struct StereoSettings {
 impl Default for StereoSettings {
     fn default() -> Self {
         Self {
-            reference_views: 24,
+            reference_views: 28,
             neighbours: 5,
             best_angle_rad: 0.13,
             max_width_px: 640,
@@ -174,7 +179,7 @@ impl<'a> Stereo<'a> {
         let count = (((most - least) * plane.intrinsics.fx * baseline).ceil() as usize).clamp(16, 128);
         let sweep = Sweep { step: ((most - least) / (count - 1) as f64) as f32, count, radius: 3 };
         let base = Image::filled(width, height, (0.5 * (least + most)) as f32);
-        let coarse = self.search(plane, &self.coarse, &neighbours, &base, sweep, Smoothness { step: 0.06, jump: 0.5 });
+        let (coarse, _) = self.search(plane, &self.coarse, &neighbours, &base, sweep, Smoothness { step: 0.06, jump: 0.5 });
         let mut inverse = base;
         for (w, &index) in inverse.pixels_mut().iter_mut().zip(coarse.index.pixels()) {
             *w += sweep.offset(index);
@@ -182,7 +187,7 @@ impl<'a> Stereo<'a> {
         let inverse = smoothed(&median(&inverse), 1);
         let (width, height) = self.fine[view].gray.size();
         let base = smoothed(&doubled(&inverse, width, height), 2);
-        Some(self.refined(view, &neighbours, &base, 0.5, 11))
+        Some(self.refined(view, &neighbours, &base, None, 0.5, 11))
     }
 
     /// Depth of one view near a known surface (`depth` at the fine scale's size, 0 unknown).
@@ -193,7 +198,8 @@ impl<'a> Stereo<'a> {
         }
         let mut base = depth.clone();
         base.pixels_mut().iter_mut().for_each(|z| *z = if *z > 0.0 { 1.0 / *z } else { 0.0 });
-        Some(self.refined(view, &neighbours, &base, 0.3, 7))
+        let filled = completed(&base);
+        Some(self.refined(view, &neighbours, &filled, Some(&base), 0.3, 9))
     }
 
     /// The size and intrinsics of a view's depth map.
@@ -201,18 +207,21 @@ impl<'a> Stereo<'a> {
         &self.fine[view]
     }
 
-    fn refined(&self, view: usize, neighbours: &[usize], base: &Image<f32>, step_px: f64, count: usize) -> DepthMap {
+    /// Around `base`; where `known` is 0 the base is a guess, and depth needs good evidence: views that start from one guess
+    /// would otherwise confirm each other's.
+    fn refined(&self, view: usize, neighbours: &[usize], base: &Image<f32>, known: Option<&Image<f32>>, step_px: f64, count: usize) -> DepthMap {
         let plane = &self.fine[view];
         let baseline = self.longest_baseline(view, neighbours);
         let sweep = Sweep { step: (step_px / (plane.intrinsics.fx * baseline)) as f32, count, radius: 4 };
-        let found = self.search(plane, &self.fine, neighbours, base, sweep, Smoothness { step: 0.03, jump: 0.3 });
+        let (found, cost) = self.search(plane, &self.fine, neighbours, base, sweep, Smoothness { step: 0.03, jump: 0.3 });
         let (width, height) = plane.gray.size();
         let mut depth = Image::filled(width, height, 0.0_f32);
         let mut weight = Image::filled(width, height, 0.0_f32);
         for i in 0..width * height {
             let w = base.pixels()[i] + sweep.offset(found.index.pixels()[i]);
             let sharpness = found.sharpness.pixels()[i];
-            if base.pixels()[i] > 0.0 && w > 0.0 && sharpness > 0.0 {
+            let guessed = known.is_some_and(|k| k.pixels()[i] <= 0.0);
+            if base.pixels()[i] > 0.0 && w > 0.0 && sharpness > 0.0 && !(guessed && cost.pixels()[i] > GUESS_COST) {
                 depth.pixels_mut()[i] = 1.0 / w;
                 let heard = if plane.weight.pixels()[i] > 0.0 { 1.0 } else { 0.3 };
                 // The flatter the valley, the vaguer the depth: variance goes with 1 / curvature.
@@ -222,13 +231,18 @@ impl<'a> Stereo<'a> {
         DepthMap { depth, weight, intrinsics: plane.intrinsics, world_from_camera: plane.world_from_camera }
     }
 
-    fn search(&self, plane: &Plane, all: &[Plane], neighbours: &[usize], base: &Image<f32>, sweep: Sweep, smoothness: Smoothness) -> Winners {
+    fn search(&self, plane: &Plane, all: &[Plane], neighbours: &[usize], base: &Image<f32>, sweep: Sweep, smoothness: Smoothness) -> (Winners, Image<f32>) {
         let (width, height) = plane.gray.size();
         let planes: Vec<&Plane> = neighbours.iter().map(|&n| &all[n]).collect();
         let (mut volume, mut sums) = (Vec::new(), Vec::new());
         costs(plane, &planes, base, sweep, &mut Scratch::default(), &mut volume);
         aggregate(&volume, width, height, sweep.count, smoothness, &mut Paths::default(), &mut sums);
-        winners(&sums, width, height, sweep.count)
+        let found = winners(&sums, width, height, sweep.count);
+        let mut cost = found.index.clone();
+        for (cost, volume) in cost.pixels_mut().iter_mut().zip(volume.chunks_exact(sweep.count)) {
+            *cost = volume[(*cost + 0.5) as usize];
+        }
+        (found, cost)
     }
 }
 
@@ -247,12 +261,11 @@ pub fn depth_maps(stereo: &Stereo<'_>, references: &[usize], progress: &dyn Prog
         return Err(LightFieldError::Stopped);
     }
     let maps: Vec<DepthMap> = maps.into_iter().flatten().collect();
-    Ok(confirmed(&maps, stereo.settings.agreement))
+    Ok(confirmed(&maps, FIRST_AGREEMENT))
 }
 
-/// The maps with only those depths that other maps see in the same place.
+/// The maps with only those depths that another map sees in the same place; the surface asks for two views once more.
 pub fn confirmed(maps: &[DepthMap], agreement: f32) -> Vec<DepthMap> {
-    let needed = if maps.len() > 3 { 2 } else { 1 };
     (maps.par_iter().enumerate())
         .map(|(index, map)| {
             let mut near: Vec<(f64, usize)> = (0..maps.len())
@@ -277,7 +290,7 @@ pub fn confirmed(maps: &[DepthMap], agreement: f32) -> Vec<DepthMap> {
                     }
                     let ray = Vector3::new((x as f32 - k.cx as f32) / k.fx as f32, (y as f32 - k.cy as f32) / k.fy as f32, 1.0);
                     let agreed = motions.iter().filter(|(other, r, t)| agrees(&maps[*other], &(r * ray * z + t), agreement)).count();
-                    if agreed < needed {
+                    if agreed == 0 {
                         out.depth.set(x, y, 0.0);
                         out.weight.set(x, y, 0.0);
                     } else {
@@ -335,6 +348,37 @@ fn fallback_range(views: &[View], settings: &StereoSettings) -> (f64, f64) {
     }
 }
 
+/// Zeros filled from what is known around them: averages over ever larger blocks, where a block knows anything.
+fn completed(image: &Image<f32>) -> Image<f32> {
+    let (width, height) = image.size();
+    if width < 2 || height < 2 || image.pixels().iter().all(|&v| v > 0.0) {
+        return image.clone();
+    }
+    let (half_width, half_height) = (width.div_ceil(2), height.div_ceil(2));
+    let mut half = Image::filled(half_width, half_height, 0.0_f32);
+    for y in 0..half_height {
+        for x in 0..half_width {
+            let (mut sum, mut count) = (0.0, 0.0);
+            for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                let value = image.at((2 * x + dx).min(width - 1), (2 * y + dy).min(height - 1));
+                if value > 0.0 {
+                    sum += value;
+                    count += 1.0;
+                }
+            }
+            half.set(x, y, if count > 0.0 { sum / count } else { 0.0 });
+        }
+    }
+    let coarse = doubled(&completed(&half), width, height);
+    let mut out = image.clone();
+    for (out, &guess) in out.pixels_mut().iter_mut().zip(coarse.pixels()) {
+        if *out <= 0.0 {
+            *out = guess;
+        }
+    }
+    out
+}
+
 fn median(image: &Image<f32>) -> Image<f32> {
     let (width, height) = image.size();
     let mut out = image.clone();
@@ -387,4 +431,23 @@ fn doubled(image: &Image<f32>, width: usize, height: usize) -> Image<f32> {
         }
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn holes_are_filled_between_their_sides() {
+        let mut image = Image::filled(40, 30, 2.0_f32);
+        for y in 0..30 {
+            for x in 12..40 {
+                image.set(x, y, if x < 25 { 0.0 } else { 4.0 });
+            }
+        }
+        let filled = completed(&image);
+        assert!(filled.pixels().iter().all(|&v| (2.0..=4.0).contains(&v)));
+        assert_eq!((filled.at(3, 3), filled.at(30, 9)), (2.0, 4.0));
+        assert!(filled.at(18, 15) > 2.2 && filled.at(18, 15) < 3.8, "{}", filled.at(18, 15));
+    }
 }

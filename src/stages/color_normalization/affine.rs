@@ -97,7 +97,8 @@ pub fn weight(color: [f32; 3]) -> f32 {
     lit * unclipped
 }
 
-const LANES: usize = 32;
+/// Pixels at a time, split into channels within the first-level cache.
+const CHUNK: usize = 256;
 
 /// Apply a map to a run of pixels.
 #[derive(Debug)]
@@ -121,15 +122,8 @@ impl Kernel for AffineRun<'_> {
             target,
             field_of_view,
         } = self;
-        let mut sources = source.chunks_exact(LANES);
-        let mut targets = target.chunks_exact_mut(LANES);
-        for (source, target) in (&mut sources).zip(&mut targets) {
-            if let (Ok(source), Ok(target)) = (<&[Rgb8; LANES]>::try_from(source), <&mut [Rgb8; LANES]>::try_from(target)) {
-                block(&map, source, target);
-            }
-        }
-        for (source, target) in sources.remainder().iter().zip(targets.into_remainder()) {
-            *target = map.apply_blended(source.map(f32::from)).map(|v| (v + 0.5) as u8);
+        for (source, target) in source.chunks(CHUNK).zip(target.chunks_mut(CHUNK)) {
+            chunk(&map, source, target);
         }
         if !field_of_view.is_empty() {
             keep_surround(source, target, field_of_view);
@@ -147,29 +141,32 @@ pub fn keep_surround(source: &[Rgb8], target: &mut [Rgb8], field_of_view: &[u8])
     }
 }
 
+/// Rounded to the nearest level, ties to even: added to 2²³ a float keeps its integer in the low bits. A plain conversion
+/// saturates, for which there is no vector instruction.
 #[inline(always)]
-fn block(map: &Affine, source: &[Rgb8; LANES], target: &mut [Rgb8; LANES]) {
-    let mut channels = [[0_u8; LANES]; 3];
-    for i in 0..LANES {
-        channels[0][i] = source[i][0];
-        channels[1][i] = source[i][1];
-        channels[2][i] = source[i][2];
+fn byte_from(value: f32) -> u8 {
+    const INTEGER_BITS: f32 = 8_388_608.0;
+    (value.clamp(0.0, 255.0) + INTEGER_BITS).to_bits() as u8
+}
+
+#[inline(always)]
+fn chunk(map: &Affine, source: &[Rgb8], target: &mut [Rgb8]) {
+    let n = source.len().min(CHUNK);
+    let (mut red, mut green, mut blue) = ([0_u8; CHUNK], [0_u8; CHUNK], [0_u8; CHUNK]);
+    let (red, green, blue) = (&mut red[..n], &mut green[..n], &mut blue[..n]);
+    for (i, color) in source.iter().enumerate() {
+        red[i] = color[0];
+        green[i] = color[1];
+        blue[i] = color[2];
     }
-    let mut results = [[0_u8; LANES]; 3];
-    for i in 0..LANES {
-        let color = [
-            f32::from(channels[0][i]),
-            f32::from(channels[1][i]),
-            f32::from(channels[2][i]),
-        ];
-        let mapped = map.apply_blended(color);
-        for c in 0..3 {
-            // Clamped first, so that the conversion need not saturate and stays one instruction.
-            results[c][i] = (mapped[c] + 0.5).clamp(0.0, 255.0) as i32 as u8;
-        }
+    for i in 0..n {
+        let [r, g, b] = map.apply_blended([f32::from(red[i]), f32::from(green[i]), f32::from(blue[i])]);
+        red[i] = byte_from(r);
+        green[i] = byte_from(g);
+        blue[i] = byte_from(b);
     }
-    for i in 0..LANES {
-        target[i] = [results[0][i], results[1][i], results[2][i]];
+    for (i, color) in target.iter_mut().enumerate() {
+        *color = [red[i], green[i], blue[i]];
     }
 }
 
@@ -203,7 +200,7 @@ mod tests {
         for i in (0..source.len()).filter(|i| *i != 20) {
             let expected = map
                 .apply_blended(source[i].map(f32::from))
-                .map(|v| (v + 0.5).clamp(0.0, 255.0) as u8);
+                .map(|v| v.clamp(0.0, 255.0).round_ties_even() as u8);
             assert_eq!(target[i], expected, "{:?}", source[i]);
         }
         for i in [7, 8, 9, 20] {

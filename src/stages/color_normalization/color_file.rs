@@ -178,7 +178,10 @@ fn correction(node: &Node) -> Result<Correction, String> {
         None | Some(Some("srgb")) => Encoding::Srgb,
         Some(Some("linear")) => Encoding::Linear,
         Some(other) => {
-            return Err(format!("`encoding` is `{}`, expected srgb or linear", other.unwrap_or("no word")));
+            return Err(format!(
+                "`encoding` is `{}`, expected srgb or linear",
+                other.unwrap_or("no word")
+            ));
         }
     };
     let matrix = numbers::<9>(node, "matrix")?;

@@ -20,6 +20,8 @@ use crate::stages::color_normalization::statistics::{self, Measurement, Statisti
 const BAND_ROWS: usize = 16;
 /// A map that moves no color by as much as this many levels is not worth a pass.
 const NEGLIGIBLE_LEVELS: f32 = 0.25;
+/// How often the first frame is measured again by the tint it showed.
+const SETTLING_ROUNDS: usize = 4;
 /// What a frame lasts when nobody tells, ms.
 const TYPICAL_PERIOD_MS: f64 = 40.0;
 
@@ -44,6 +46,9 @@ pub struct ColorNormalization {
     /// Sum of the clip's first statistics, their number, and the time they cover, ms.
     start: Option<(Statistics, f64, f64)>,
     map: Affine,
+    /// The channel gains that bring the mean to the reference's: what a sample is judged by. The map itself would not do:
+    /// steel among the samples bends it, and the bent map would let in more steel.
+    gains: Affine,
     measured: u32,
     baked: BakedLut,
     baked_for: Option<Affine>,
@@ -67,6 +72,7 @@ impl ColorNormalization {
             reference: given.filter(|_| settings.reference == ReferenceSource::Given),
             start: None,
             map: Affine::IDENTITY,
+            gains: Affine::IDENTITY,
             measured: 0,
             baked: BakedLut::default(),
             baked_for: None,
@@ -100,12 +106,26 @@ impl ColorNormalization {
     }
 
     fn update_map(&mut self, frame: &Frame, step_ms: f64) {
-        let found = self.measure(frame);
-        let Some(now) = found.statistics else { return };
-        if frame.scene_cut || found.instrument_share > self.settings.max_instrument_share {
+        if frame.scene_cut {
             return;
         }
-        let Some(target) = self.target(&now, step_ms) else { return };
+        let mut found = self.measure(frame);
+        if self.measured == 0 {
+            // Nothing is known yet about the tint by which samples are judged: settle it on this frame.
+            for _ in 0..SETTLING_ROUNDS {
+                let Some(now) = found.statistics else { return };
+                self.gains = self.target_gains(&now).unwrap_or(Affine::IDENTITY);
+                found = self.measure(frame);
+            }
+        }
+        let Some(now) = found.statistics else { return };
+        if found.instrument_share > self.settings.max_instrument_share {
+            return;
+        }
+        self.take_start(&now, step_ms);
+        let (Some(target), Some(gains)) = (self.target(&now), self.target_gains(&now)) else {
+            return;
+        };
         self.measured = self.measured.saturating_add(1);
         let steady = if self.settings.smoothing_ms > 0.0 {
             1.0 - (-step_ms / self.settings.smoothing_ms).exp()
@@ -115,42 +135,60 @@ impl ColorNormalization {
         // The first measurements count equally, so that the map is there at once and does not swing in.
         let alpha = steady.max(1.0 / f64::from(self.measured));
         self.map.approach(&target, alpha as f32);
+        self.gains.approach(&gains, alpha as f32);
     }
 
     fn measure(&self, frame: &Frame) -> Measurement {
         let instruments = frame.instruments.as_deref();
         let field_of_view = frame.field_of_view.as_deref();
+        let judged = |c| self.gains.apply(c);
         match &self.correction {
-            Some(correction) => statistics::measure(&frame.image, field_of_view, instruments, |c| correction.apply(c)),
-            None => statistics::measure(&frame.image, field_of_view, instruments, |c| c),
+            Some(correction) => statistics::measure(&frame.image, field_of_view, instruments, |c| correction.apply(c), judged),
+            None => statistics::measure(&frame.image, field_of_view, instruments, |c| c, judged),
         }
     }
 
-    /// The map this frame alone would ask for; `None` while the reference is being taken.
-    fn target(&mut self, now: &Statistics, step_ms: f64) -> Option<Affine> {
+    /// While the clip's own start is to be the reference: add a frame to it.
+    fn take_start(&mut self, now: &Statistics, step_ms: f64) {
+        if self.reference.is_some() || self.settings.reference != ReferenceSource::Start {
+            return;
+        }
+        let zero = Statistics {
+            mean: nalgebra::Vector3::zeros(),
+            covariance: nalgebra::Matrix3::zeros(),
+        };
+        let (sum, count, covered_ms) = self.start.get_or_insert((zero, 0.0, 0.0));
+        sum.mean += now.mean;
+        sum.covariance += now.covariance;
+        *count += 1.0;
+        *covered_ms += step_ms;
+        if *covered_ms >= self.settings.start_ms {
+            self.reference = Some(Reference {
+                mean: sum.mean / *count,
+                covariance: Some(sum.covariance / *count),
+            });
+            // The map starts from the identity and from here on changes only as fast as the smoothing allows.
+            self.measured = u32::MAX;
+        }
+    }
+
+    /// The gains these statistics ask for; `None` while there is no reference.
+    fn target_gains(&self, now: &Statistics) -> Option<Affine> {
+        let to = match self.settings.reference {
+            ReferenceSource::Gray => return Some(Affine::IDENTITY),
+            _ => Statistics {
+                mean: self.reference.as_ref()?.mean,
+                covariance: now.covariance,
+            },
+        };
+        Some(affine_between(now, &to, Method::GrayWorld, 1.0))
+    }
+
+    /// The map these statistics ask for; `None` while there is no reference.
+    fn target(&self, now: &Statistics) -> Option<Affine> {
         let strength = self.settings.strength;
         if self.settings.reference == ReferenceSource::Gray {
             return Some(affine_between(now, &gray_of(now), Method::GrayWorld, strength));
-        }
-        if self.reference.is_none() && self.settings.reference == ReferenceSource::Start {
-            let zero = Statistics {
-                mean: nalgebra::Vector3::zeros(),
-                covariance: nalgebra::Matrix3::zeros(),
-            };
-            let (sum, count, covered_ms) = self.start.get_or_insert((zero, 0.0, 0.0));
-            sum.mean += now.mean;
-            sum.covariance += now.covariance;
-            *count += 1.0;
-            *covered_ms += step_ms;
-            if *covered_ms >= self.settings.start_ms {
-                self.reference = Some(Reference {
-                    mean: sum.mean / *count,
-                    covariance: Some(sum.covariance / *count),
-                });
-                // The map starts from the identity and from here on changes only as fast as the smoothing allows.
-                self.measured = u32::MAX;
-            }
-            return None;
         }
         let reference = self.reference.as_ref()?;
         Some(match reference.covariance {

@@ -18,7 +18,7 @@ const CLIPPED_LEVEL: f32 = 250.0;
 const SPECULAR_LEVEL: f32 = 205.0;
 const SPECULAR_SATURATION: f32 = 0.25;
 /// Steel: less saturated than this at any brightness. Tissue under a scope's lamp lies above 0.25.
-const STEEL_SATURATION: f32 = 0.10;
+const STEEL_SATURATION: f32 = 0.15;
 /// Fewer samples make no statistics.
 const MIN_SAMPLES: usize = 64;
 
@@ -40,12 +40,15 @@ pub struct Measurement {
     pub instrument_share: f64,
 }
 
-/// Measure the tissue of a picture; `correct` maps each sample first (a camera's fixed correction).
+/// Measure the tissue of a picture. `correct` maps each sample first (a camera's fixed correction); `judged` maps the result
+/// further, to the reference's colors as far as they are known: whether a color is steel can only be told there, because a
+/// tint gives steel a color.
 pub fn measure(
     image: &Image<Rgb8>,
     field_of_view: Option<&Mask>,
     instruments: Option<&Image<u8>>,
     correct: impl Fn([f32; 3]) -> [f32; 3],
+    judged: impl Fn([f32; 3]) -> [f32; 3],
 ) -> Measurement {
     let (width, height) = image.size();
     let field_of_view = field_of_view.filter(|mask| mask.size() == image.size());
@@ -61,9 +64,14 @@ pub fn measure(
             }
             let four = [upper[x], upper[x + 1], lower[x], lower[x + 1]];
             let color: [f32; 3] = std::array::from_fn(|c| four.iter().map(|pixel| f32::from(pixel[c])).sum::<f32>() / 4.0);
-            let highest = color[0].max(color[1]).max(color[2]);
-            let lowest = color[0].min(color[1]).min(color[2]);
-            if highest < MIN_LEVEL || four.iter().flatten().any(|v| f32::from(*v) >= CLIPPED_LEVEL) {
+            if four.iter().flatten().any(|v| f32::from(*v) >= CLIPPED_LEVEL) {
+                continue;
+            }
+            let color = correct(color);
+            let seen = judged(color);
+            let highest = seen[0].max(seen[1]).max(seen[2]);
+            let lowest = seen[0].min(seen[1]).min(seen[2]);
+            if highest < MIN_LEVEL {
                 continue;
             }
             let saturation = (highest - lowest) / highest;
@@ -75,7 +83,7 @@ pub fn measure(
                 continue;
             }
             tissue += 1;
-            let [r, g, b] = correct(color).map(f64::from);
+            let [r, g, b] = color.map(f64::from);
             for (sum, value) in sum.iter_mut().zip([r, g, b]) {
                 *sum += value;
             }
@@ -125,7 +133,7 @@ mod tests {
                 image.set(x, y, color);
             }
         }
-        let found = measure(&image, None, None, |c| c);
+        let found = measure(&image, None, None, |c| c, |c| c);
         let statistics = found.statistics.unwrap();
         // Uniform ±30 averaged over 2 × 2: variance 300 / 4 = 75, its mean known to 8.7 / √2750 = 0.17.
         assert!(

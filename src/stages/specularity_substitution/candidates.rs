@@ -9,7 +9,22 @@ use crate::geometry::transform::Transform;
 use crate::light_field::view::{LightField, View};
 
 /// At most so many views are blended.
-pub const MAX_VIEWS: usize = 4;
+pub const MAX_VIEWS: usize = 8;
+
+/// Places of a hole that are asked for, at most: one bit each.
+pub const MAX_PLACES: usize = 64;
+
+/// Every place of a hole should be seen by so many views.
+const WANTED_SIGHTINGS: usize = 3;
+
+/// What sighting all places still wanted is worth against a worse angle, rad.
+const SIGHTING_WORTH: f64 = 0.5;
+
+/// The first sighting of a place is worth more than the second, and that more than the third.
+const WORTH_OF_NEXT: [f64; WANTED_SIGHTINGS] = [1.0, 0.2, 0.1];
+
+/// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
+const HEARD_FROM: u8 = 25;
 
 /// Relative difference of depth beyond which a view sees something else.
 const OCCLUSION_TOLERANCE: f32 = 0.03;
@@ -23,14 +38,26 @@ pub struct Candidate {
     pub weight: f32,
 }
 
-/// The views in the order of their penalty at one place; keeps its memory.
+/// A view that sees something of the hole.
+#[derive(Clone, Copy, Debug)]
+struct Sight {
+    penalty: f64,
+    view: usize,
+    /// One bit a place.
+    places: u64,
+}
+
+/// Looks for views; keeps its memory.
 #[derive(Debug, Default)]
 pub struct CandidateSearch {
-    ranked: Vec<(f64, usize)>,
+    sights: Vec<Sight>,
 }
 
 impl CandidateSearch {
-    /// Choose up to [`MAX_VIEWS`] views for the world points `hole` (a sample of the region, seen from `eye`).
+    /// Choose up to [`MAX_VIEWS`] views for the world points `hole` (at most [`MAX_PLACES`] places of it, seen from `eye`).
+    ///
+    /// The lamp's image moves little between neighbouring views, so the best views by angle are often dazzled at the very place that is
+    /// asked for: views are taken one by one, each for its angle and for the places that too few of those before it saw.
     pub fn choose(
         &mut self,
         light_field: &LightField,
@@ -42,34 +69,52 @@ impl CandidateSearch {
         if hole.is_empty() {
             return;
         }
+        let hole = &hole[..hole.len().min(MAX_PLACES)];
         let centre = hole.iter().sum::<Vector3<f64>>() / hole.len() as f64;
-        self.ranked.clear();
+        self.sights.clear();
         for (index, view) in light_field.views.iter().enumerate() {
             if let Some(penalty) = penalty(view, eye, &centre) {
-                self.ranked.push((penalty, index));
+                let places = places_seen(view, hole);
+                if places != 0 {
+                    self.sights.push(Sight {
+                        penalty,
+                        view: index,
+                        places,
+                    });
+                }
             }
         }
-        self.ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // A view that is itself dazzled here is of no use however near it stands: what it saw of the hole counts.
-        self.ranked.truncate(28);
-        for entry in &mut self.ranked {
-            let seen = coverage(&light_field.views[entry.1], hole);
-            entry.0 = if seen < 0.05 {
-                f64::MAX
-            } else {
-                entry.0 + 0.12 * (1.0 - seen)
+        let mut sightings = [0_usize; MAX_PLACES];
+        while chosen.len() < MAX_VIEWS {
+            let worth = |bits: u64| -> f64 {
+                (0..hole.len())
+                    .filter(|&p| bits >> p & 1 != 0)
+                    .filter_map(|p| WORTH_OF_NEXT.get(sightings[p]))
+                    .sum()
             };
+            let wanted = worth(u64::MAX);
+            if wanted == 0.0 {
+                break;
+            }
+            let cost = |sight: &Sight| sight.penalty - SIGHTING_WORTH * worth(sight.places) / wanted;
+            let Some(best) = (0..self.sights.len()).min_by(|&a, &b| cost(&self.sights[a]).total_cmp(&cost(&self.sights[b])))
+            else {
+                break;
+            };
+            let sight = self.sights.swap_remove(best);
+            for (place, count) in sightings.iter_mut().enumerate().take(hole.len()) {
+                *count += (sight.places >> place & 1) as usize;
+            }
+            // Until the threshold is known the weight holds the penalty.
+            chosen.push(Candidate {
+                view: sight.view,
+                weight: sight.penalty as f32,
+            });
         }
-        self.ranked.retain(|entry| entry.0 < f64::MAX);
-        self.ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-        // Buehler 2001: weights fall to zero at the first view that is left out.
-        let threshold = self
-            .ranked
-            .get(MAX_VIEWS)
-            .map_or_else(|| self.ranked.last().map_or(1.0, |e| 1.5 * e.0 + 0.01), |e| e.0 + 1e-6);
-        for &(penalty, view) in self.ranked.iter().take(MAX_VIEWS) {
-            let weight = (1.0 - penalty / threshold).max(0.02) as f32;
-            chosen.push(Candidate { view, weight });
+        // Buehler 2001: weights fall to zero at a threshold; here beyond the worst view that was needed.
+        let threshold = 1.3 * chosen.iter().map(|c| c.weight).fold(0.01, f32::max);
+        for candidate in chosen {
+            candidate.weight = (1.0 - candidate.weight / threshold).max(0.02);
         }
     }
 }
@@ -95,22 +140,24 @@ fn border_distance(camera: &CameraModel, x: f64, y: f64) -> f64 {
         .min(camera.height as f64 - 1.0 - y)
 }
 
-/// The share of the points that the view saw free of lamp and obstacle.
-fn coverage(view: &View, points: &[Vector3<f64>]) -> f64 {
+/// The places that the view saw free of lamp and obstacle, one bit each.
+fn places_seen(view: &View, places: &[Vector3<f64>]) -> u64 {
     let camera_from_world = view.world_from_camera.inverse();
-    let seen = points.iter().filter(|point| {
-        let p = camera_from_world * Point::<World>::from_coords(**point);
-        view.camera.project(p).is_some_and(|pixel| {
+    let mut bits = 0;
+    for (index, place) in places.iter().enumerate() {
+        let p = camera_from_world * Point::<World>::from_coords(*place);
+        let seen = view.camera.project(p).is_some_and(|pixel| {
             let (x, y) = (pixel.x.round(), pixel.y.round());
             x >= 0.0
                 && y >= 0.0
                 && x < view.camera.width as f64
                 && y < view.camera.height as f64
-                && view.confidence.at(x as usize, y as usize) > 128
+                && view.confidence.at(x as usize, y as usize) >= HEARD_FROM
                 && is_unoccluded(view.depth.at(x as usize, y as usize), p.coords.z as f32)
-        })
-    });
-    seen.count() as f64 / points.len() as f64
+        });
+        bits |= u64::from(seen) << index;
+    }
+    bits
 }
 
 /// True if a surface seen at depth `held` is what lies at depth `asked`; an unknown depth hides nothing.

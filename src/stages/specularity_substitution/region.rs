@@ -7,12 +7,13 @@ use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::blur::BlurScratch;
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::light_field::mapping::Mapping;
 use crate::light_field::view::LightField;
 use crate::stages::specularity_substitution::brightness::LogRatio;
-use crate::stages::specularity_substitution::candidates::{Candidate, CandidateSearch, MAX_VIEWS};
+use crate::stages::specularity_substitution::candidates::{Candidate, CandidateSearch, MAX_PLACES, MAX_VIEWS};
 use crate::stages::specularity_substitution::ring::{Detail, luminance, shift_between};
 use crate::stages::specularity_substitution::stage::Settings;
-use crate::stages::specularity_substitution::warp::{Mapping, WarpedView, Window};
+use crate::stages::specularity_substitution::warp::{WarpedView, Window};
 
 /// What a region looks at of the live frame.
 #[derive(Clone, Copy, Debug)]
@@ -126,7 +127,6 @@ impl Workbench {
         self.hole.clear();
         let step = scene.image.width().div_ceil(scene.depth.width()).max(1);
         let guard = (settings.guard_px * scene.scale * 3.0) as u16;
-        let every = (window.area() / 4000).max(1) * 7;
         for y in window.top..window.top + window.height {
             let depths = scene.depth.row((y / step).min(scene.depth.height() - 1));
             let columns = window.left..window.left + window.width;
@@ -139,18 +139,18 @@ impl Workbench {
                 self.good
                     .push(!forbidden && distance > guard && depth > 0.0 && pixel.iter().any(|&c| c < 250));
                 self.fine.push(distance <= guard);
-                if distance == 0 && depth > 0.0 && !forbidden && self.depth.len() % every == 0 {
-                    let k = &scene.camera.intrinsics;
-                    let z = f64::from(depth);
-                    let point = nalgebra::Point3::new((x as f64 - k.cx) / k.fx * z, (y as f64 - k.cy) / k.fy * z, z);
-                    self.hole.push((scene.eye.isometry() * point).coords);
-                }
             }
         }
-        if self.hole.is_empty() {
-            // Too small for the sampling: take any one.
-            let first = (0..window.area()).find(|&i| self.fine[i] && self.depth[i] > 0.0);
-            if let Some(index) = first {
+        // Places of the hole, evenly among its pixels.
+        let wanted = |bench: &Self, index: usize| bench.fine[index] && bench.depth[index] > 0.0;
+        let pixels = (0..window.area()).filter(|&i| wanted(self, i)).count();
+        let every = pixels.div_ceil(MAX_PLACES).max(1);
+        let mut counted = 0;
+        for index in 0..window.area() {
+            if !wanted(self, index) {
+                continue;
+            }
+            if counted % every == 0 {
                 let k = &scene.camera.intrinsics;
                 let (x, y) = (
                     (window.left + index % window.width) as f64,
@@ -160,6 +160,7 @@ impl Workbench {
                 let point = nalgebra::Point3::new((x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z);
                 self.hole.push((scene.eye.isometry() * point).coords);
             }
+            counted += 1;
         }
     }
 

@@ -10,6 +10,7 @@ use crate::frame::{Frame, Provenance, provenance_code};
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::components::Components;
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
+use crate::image::hole_filling::HoleFiller;
 use crate::image::pool::Pool;
 use crate::image::specularity::REFERENCE_WIDTH_PX;
 use crate::light_field::rasterize::DepthRasterizer;
@@ -70,6 +71,7 @@ pub struct SpecularitySubstitution {
     settings: Settings,
     light_field: Option<Arc<LightField>>,
     rasterizer: DepthRasterizer,
+    filler: HoleFiller,
     depth: Image<f32>,
     coarse_camera: Option<CameraModel>,
     distance: Image<u16>,
@@ -84,6 +86,9 @@ pub struct SpecularitySubstitution {
     views: Pool<u16>,
 }
 
+/// Depth is carried into holes over about 2 to this power, px of the depth's picture.
+const DEPTH_REACH_LEVELS: usize = 6;
+
 /// Widest picture over which depth is drawn pixel for pixel.
 const DEPTH_WIDTH_PX: usize = 960;
 
@@ -94,6 +99,7 @@ impl SpecularitySubstitution {
             settings: settings.clone(),
             light_field,
             rasterizer: DepthRasterizer::new(),
+            filler: HoleFiller::default(),
             depth: Image::filled(0, 0, 0.0),
             coarse_camera: None,
             distance: Image::filled(0, 0, 0),
@@ -162,6 +168,9 @@ impl SpecularitySubstitution {
             *coarse = camera.scaled(1.0 / step as f64);
         }
         self.rasterizer.render(&light_field.surface, coarse, pose, &mut self.depth);
+        // The survey's stereo is blind under its own specularities: there the surface is taken to go on smoothly. Only the place is
+        // guessed so, not the colour, and a wrong place shows on the ring.
+        self.filler.fill(&mut self.depth, DEPTH_REACH_LEVELS);
     }
 
     /// The frame's pixels, each from its region's result.
@@ -216,6 +225,16 @@ impl SpecularitySubstitution {
             energy += filled.residual_levels * filled.residual_levels;
             shift += filled.shift_px * filled.shift_px;
             count += 1.0;
+        }
+        for f in self.regions.iter().take(self.windows.len()) {
+            eprintln!(
+                "DBG {} {:?} res {:.2} shift {:.2} area {}",
+                frame.id.0,
+                f.verdict,
+                f.residual_levels,
+                f.shift_px,
+                f.window.area()
+            );
         }
         if let Some(alignment) = &mut frame.alignment
             && count > 0.0

@@ -1,11 +1,7 @@
 //! A view drawn as the live camera would see it, over a box of pixels.
 
-use nalgebra::{Matrix3, Vector3};
-
-use crate::camera::model::CameraModel;
-use crate::geometry::space::{Camera, World};
-use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Rgb8};
+use crate::light_field::mapping::Mapping;
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::candidates::is_unoccluded;
 
@@ -26,36 +22,6 @@ impl Window {
     /// Number of pixels.
     pub fn area(&self) -> usize {
         self.width * self.height
-    }
-}
-
-/// From a pixel and its depth in the live picture to the pixel and depth in a view: p_view ~ M·(x, y, 1)·z + b.
-#[derive(Clone, Copy, Debug)]
-pub struct Mapping {
-    m: [[f32; 3]; 3],
-    b: [f32; 3],
-}
-
-impl Mapping {
-    /// Between two pinholes.
-    pub fn new(live: &CameraModel, eye: &Transform<World, Camera>, view: &View) -> Option<Self> {
-        let view_from_live = view.world_from_camera.inverse() * *eye;
-        let rotation = view_from_live.rotation().to_rotation_matrix().into_inner();
-        let m: Matrix3<f64> = view.camera.intrinsics.matrix() * rotation * live.intrinsics.matrix().try_inverse()?;
-        let b: Vector3<f64> = view.camera.intrinsics.matrix() * view_from_live.translation();
-        Some(Self {
-            m: std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)] as f32)),
-            b: std::array::from_fn(|i| b[i] as f32),
-        })
-    }
-
-    /// Column, row and depth in the view.
-    #[inline]
-    fn apply(&self, x: f32, y: f32, z: f32) -> (f32, f32, f32) {
-        let row = |i: usize| (self.m[i][0] * x + self.m[i][1] * y + self.m[i][2]) * z + self.b[i];
-        let depth = row(2);
-        let inverse = 1.0 / depth;
-        (row(0) * inverse, row(1) * inverse, depth)
     }
 }
 

@@ -40,7 +40,8 @@ impl Guard {
         let rows = height.div_ceil(BLOCK);
         self.stats.resize(columns * rows, BlockStats::default());
         self.motions.resize(columns * rows, Motion::Moving);
-        let older: [usize; LAGS] = [window / 2, window - 1];
+        let held = history.count().saturating_sub(1);
+        let older: [usize; LAGS] = [(window / 2).min(held), (window - 1).min(held)];
         let sigma = self.noise.variance_at(128.0).sqrt();
         let inlier_bound = (OUTLIER_SIGMAS * std::f32::consts::SQRT_2 * sigma + 4.0).clamp(10.0, 63.0) as u8;
         let band = BLOCK * width;

@@ -174,7 +174,7 @@ fn judge(stats: &[BlockStats], columns: usize, rows: usize, (x, y): (usize, usiz
     let mut still = true;
     let mut strongest = 0.0_f32;
     let mut around = [0.0_f32; LAGS];
-    for lag in 0..LAGS {
+    for (lag, around) in around.iter_mut().enumerate() {
         let n = block.inliers[lag];
         if n >= MIN_INLIERS {
             let mean_square = block.squares[lag] as f32 / n as f32;
@@ -194,7 +194,7 @@ fn judge(stats: &[BlockStats], columns: usize, rows: usize, (x, y): (usize, usiz
         }
         if inliers >= MIN_INLIERS as f32 {
             still &= squares <= STILL_RATIO_AROUND * expected + SLACK * inliers;
-            around[lag] = squares / inliers;
+            *around = squares / inliers;
             strongest = strongest.max(((squares / inliers) - SLACK) / (expected / inliers));
         }
     }

@@ -10,9 +10,14 @@ use crate::image::buffer::{Image, Rgb8};
 use crate::stages::temporal_median::motion::{BLOCK, BlockStats, Motion};
 use crate::stages::temporal_median::noise::Noise;
 
-/// A particle's contrast in the median is at most this share of that in the newest frame; in still and in slow blocks.
+/// A particle's contrast in the median is at most this share of that in the newest frame; where the median speaks anyway,
+/// and where it speaks only for particles.
 const MAX_CONTRAST_STILL: f32 = 0.75;
 const MAX_CONTRAST_SLOW: f32 = 0.45;
+/// Particles that touch make a blob of up to this many times the extent of one; it must lose this much contrast, and all of
+/// it must lie where motion would have shown.
+const CLUSTER_EXTENTS: usize = 2;
+const MAX_CONTRAST_CLUSTER: f32 = 0.35;
 /// Below this share the other way round, something has gone.
 const GONE_CONTRAST: f32 = 0.75;
 /// Where the border is looked at: this far out, px.
@@ -70,6 +75,8 @@ pub struct Evidence<'a> {
     pub noise: &'a Noise,
     /// Largest extent of a particle, px.
     pub max_extent_px: usize,
+    /// What is no particle stays as it came even where the picture is still: the window is too short to tell slow motion.
+    pub particles_only: bool,
 }
 
 fn gray(color: Rgb8) -> i32 {
@@ -201,8 +208,20 @@ impl Particles {
 
     fn suspect_blocks(&mut self, columns: usize, evidence: &Evidence<'_>) {
         let rows = evidence.motions.len() / columns;
+        // Blobs are not sought in moving blocks, so what has gone from there is not found either: a specularity that
+        // wanders from a moving block into a smooth still one would look like a particle.
+        for (block, motion) in evidence.motions.iter().enumerate() {
+            if *motion == Motion::Moving {
+                let (bx, by) = (block % columns, block / columns);
+                for y in by.saturating_sub(1)..(by + 2).min(rows) {
+                    for x in bx.saturating_sub(1)..(bx + 2).min(columns) {
+                        self.suspect[y * columns + x] |= 1;
+                    }
+                }
+            }
+        }
         for blob in &self.blobs {
-            let large = extent(blob) > evidence.max_extent_px;
+            let large = extent(blob) > evidence.max_extent_px && !is_cluster(blob, columns, evidence);
             let gone = (blob.contrast_newest as f32) < GONE_CONTRAST * blob.contrast_median as f32;
             if !large && !gone {
                 continue;
@@ -217,7 +236,7 @@ impl Particles {
     }
 
     fn is_particle(&self, blob: &Blob, columns: usize, evidence: &Evidence<'_>) -> bool {
-        if extent(blob) > evidence.max_extent_px {
+        if extent(blob) > evidence.max_extent_px && !is_cluster(blob, columns, evidence) {
             return false;
         }
         let mut limit = MAX_CONTRAST_STILL;
@@ -225,13 +244,11 @@ impl Particles {
             for x in blob.left / BLOCK..=blob.right / BLOCK {
                 let block = y * columns + x;
                 let still = evidence.motions[block] == Motion::Still;
-                if !still {
+                if !still || evidence.particles_only {
                     limit = MAX_CONTRAST_SLOW;
                 }
-                let stats = &evidence.stats[block];
-                let convinced = still && stats.texture > TEXTURED * evidence.noise.variance_at(stats.level);
                 let suspect = self.suspect[block];
-                if suspect & 2 != 0 || (suspect & 1 != 0 && !convinced) {
+                if suspect & 2 != 0 || (suspect & 1 != 0 && !is_convincing(block, evidence)) {
                     return false;
                 }
             }
@@ -244,7 +261,8 @@ impl Particles {
         let columns = width.div_ceil(BLOCK);
         for (block, motion) in evidence.motions.iter().enumerate() {
             // Moving blocks hold the newest frame already.
-            if *motion == Motion::Moving || (*motion == Motion::Still && !self.busy[block]) {
+            let median_rules = *motion == Motion::Still && !evidence.particles_only;
+            if *motion == Motion::Moving || (median_rules && !self.busy[block]) {
                 continue;
             }
             let (left, top) = (block % columns * BLOCK, block / columns * BLOCK);
@@ -258,7 +276,7 @@ impl Particles {
                 }
                 let marks = &self.marks[y * width + left..y * width + right];
                 for ((target, newest), mark) in target.iter_mut().zip(newest).zip(marks) {
-                    let keep = if *motion == Motion::Still {
+                    let keep = if median_rules {
                         mark & (KEEP_NEWEST | TAKE_MEDIAN) == KEEP_NEWEST
                     } else {
                         mark & TAKE_MEDIAN == 0
@@ -270,6 +288,22 @@ impl Particles {
             }
         }
     }
+}
+
+/// Still, and textured enough that motion would have shown.
+fn is_convincing(block: usize, evidence: &Evidence<'_>) -> bool {
+    let stats = &evidence.stats[block];
+    let textured = stats.texture > TEXTURED * evidence.noise.variance_at(stats.level);
+    evidence.motions[block] == Motion::Still && textured
+}
+
+fn is_cluster(blob: &Blob, columns: usize, evidence: &Evidence<'_>) -> bool {
+    let small = extent(blob) <= CLUSTER_EXTENTS * evidence.max_extent_px;
+    let mut blocks = (blob.top / BLOCK..=blob.bottom / BLOCK)
+        .flat_map(|y| (blob.left / BLOCK..=blob.right / BLOCK).map(move |x| y * columns + x));
+    small
+        && (blob.contrast_median as f32) < MAX_CONTRAST_CLUSTER * blob.contrast_newest as f32
+        && blocks.all(|block| is_convincing(block, evidence))
 }
 
 fn extent(blob: &Blob) -> usize {

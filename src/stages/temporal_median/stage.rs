@@ -13,7 +13,7 @@ use crate::stages::temporal_median::history::History;
 use crate::stages::temporal_median::motion::{BLOCK, Motion};
 use crate::stages::temporal_median::particles::{Evidence, Particles};
 use crate::stages::temporal_median::settings::{Settings, SettingsError};
-use crate::stages::temporal_median::vector_median::Run;
+use crate::stages::temporal_median::vector_median::{Colors, Run, Wide};
 
 /// A gap of more periods than this makes the history worthless.
 const MAX_GAP_PERIODS: f64 = 2.6;
@@ -21,6 +21,8 @@ const MAX_GAP_PERIODS: f64 = 2.6;
 const CHANNEL_OVER_GRAY: f32 = 1.633;
 /// Departures from the median below this many standard deviations are noise.
 const DEPARTURE_SIGMAS: f32 = 4.5;
+/// With only one older frame there is no median yet: its noise is that of a frame, and nothing confirms it.
+const TWO_FRAMES_CAUTION: f32 = 1.8;
 
 /// Takes away what is in the picture only for a moment.
 #[derive(Debug)]
@@ -78,18 +80,23 @@ impl TemporalMedian {
         }
     }
 
-    /// The window for the newest frame: odd, no longer than the history.
+    /// The window for the newest frame: odd, no longer than the history. Two frames make a window of three in which the
+    /// older one counts twice: the median is the older one, and the guard decides whether it knows better.
     fn window(&self) -> usize {
         let wanted = self.period_ms.map_or(3, |period| self.settings.frames_from_period(period));
         let held = self.history.count();
         let held_odd = if held % 2 == 1 { held } else { held.saturating_sub(1) };
-        wanted.min(held_odd)
+        if held == 2 { 3 } else { wanted.min(held_odd) }
     }
 
-    fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8) {
+    fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8)
+    where
+        [Wide; N]: Colors<N>,
+    {
         let (width, height) = newest.size();
         let columns = width.div_ceil(BLOCK);
-        let window = std::array::from_fn(|age| self.history.planes(age));
+        let oldest = self.history.count().saturating_sub(1);
+        let window = std::array::from_fn(|age| self.history.planes(age.min(oldest)));
         let motions = &self.guard.motions;
         let (method, distance) = (self.settings.method, self.settings.distance);
         self.output
@@ -156,9 +163,10 @@ impl Stage for TemporalMedian {
             self.guard.motions.fill(Motion::Still);
         }
         let sigma = self.guard.noise.variance_at(128.0).sqrt() * CHANNEL_OVER_GRAY;
-        let threshold = (self.settings.min_particle_levels as f32)
-            .max(DEPARTURE_SIGMAS * sigma)
-            .min(120.0) as u8;
+        let two_frames = self.history.count() == 2;
+        let caution = if two_frames { TWO_FRAMES_CAUTION } else { 1.0 };
+        let threshold = (self.settings.min_particle_levels as f32).max(DEPARTURE_SIGMAS * sigma);
+        let threshold = (caution * threshold).min(120.0) as u8;
         match window {
             3 => self.median::<3>(&frame.image, threshold),
             5 => self.median::<5>(&frame.image, threshold),
@@ -174,6 +182,7 @@ impl Stage for TemporalMedian {
                 motions: &self.guard.motions,
                 noise: &self.guard.noise,
                 max_extent_px,
+                particles_only: two_frames,
             };
             self.particles.settle(&evidence, &mut self.output);
         }

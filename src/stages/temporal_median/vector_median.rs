@@ -4,16 +4,19 @@
 //! median filters, Proc. IEEE 78(4), 1990, doi:10.1109/5.54807): it is always one of the colors that were seen. Of equal
 //! sums the newest wins.
 //!
-//! The kernel works on 32 pixels at a time: differences in u8, sums in u16, the choice by selection instead of branches,
-//! so that the compiler keeps the whole competition in vector registers.
+//! Everything is computed in i16 and chosen by selection instead of branches: with one width throughout, the compiler keeps
+//! the whole competition in vector registers, 16 pixels at a time (in mixed widths it was ten times slower).
 
 use crate::image::buffer::Rgb8;
 use crate::image::wide::Kernel;
 use crate::stages::temporal_median::history::Planes;
 use crate::stages::temporal_median::settings::{Distance, Method};
 
-const LANES: usize = 32;
-type Lane = [u8; LANES];
+/// Pixels at a time: results stay in the first-level cache until they are interleaved.
+const CHUNK: usize = 256;
+
+/// A color, widened.
+pub type Wide = [i16; 3];
 
 /// One run of consecutive pixels.
 #[derive(Debug)]
@@ -34,20 +37,26 @@ pub struct Run<'a, const N: usize> {
     pub distance: Distance,
 }
 
-impl<const N: usize> Kernel for Run<'_, N> {
+impl<const N: usize> Kernel for Run<'_, N>
+where
+    [Wide; N]: Colors<N>,
+{
     #[inline(always)]
     fn run(self) {
         match (self.method, self.distance) {
-            (Method::Marginal, _) => self.with(marginal),
-            (Method::Vector, Distance::L1) => self.with(|window| vector(window, l1)),
-            (Method::Vector, Distance::L2) => self.with(|window| vector(window, l2)),
+            (Method::Marginal, _) => self.with(|colors| colors.marginal_median()),
+            (Method::Vector, Distance::L1) => self.with(|colors| colors.vector_median(l1)),
+            (Method::Vector, Distance::L2) => self.with(|colors| colors.vector_median(l2)),
         }
     }
 }
 
-impl<const N: usize> Run<'_, N> {
+impl<const N: usize> Run<'_, N>
+where
+    [Wide; N]: Colors<N>,
+{
     #[inline(always)]
-    fn with(self, choose: impl Fn(&[[Lane; 3]; N]) -> [Lane; 3]) {
+    fn with(self, choose: impl Fn([Wide; N]) -> Wide) {
         let Self {
             window,
             start,
@@ -56,151 +65,120 @@ impl<const N: usize> Run<'_, N> {
             threshold,
             ..
         } = self;
-        let count = median.len();
-        let mut done = 0;
-        while done < count {
-            let length = LANES.min(count - done);
-            let at = start + done;
-            let mut colors = [[[0_u8; LANES]; 3]; N];
-            for (lanes, planes) in colors.iter_mut().zip(&window) {
-                for (lane, plane) in lanes.iter_mut().zip(&planes.color) {
-                    if let Some(whole) = plane.get(at..at + LANES) {
-                        lane.copy_from_slice(whole);
-                    } else {
-                        lane[..length].copy_from_slice(&plane[at..at + length]);
+        // The window and the results lie in local arrays of fixed length: nothing else can point to them and no index can
+        // leave them, so the compiler vectorizes without asking.
+        let mut colors = [[[0_i16; CHUNK]; 3]; N];
+        let mut results = [[0_i16; CHUNK]; 4];
+        let threshold = i16::from(threshold);
+        let mut at = start;
+        for (median, departs) in median.chunks_mut(CHUNK).zip(departs.chunks_mut(CHUNK)) {
+            let n = median.len().min(CHUNK);
+            for (colors, planes) in colors.iter_mut().zip(&window) {
+                for (color, plane) in colors.iter_mut().zip(&planes.color) {
+                    for (color, level) in color.iter_mut().zip(&plane[at..at + n]) {
+                        *color = i16::from(*level);
                     }
                 }
             }
-            let [red, green, blue] = choose(&colors);
-            let mut far = [0_u8; LANES];
-            for i in 0..LANES {
-                let [r, g, b] = [
-                    red[i].abs_diff(colors[0][0][i]),
-                    green[i].abs_diff(colors[0][1][i]),
-                    blue[i].abs_diff(colors[0][2][i]),
-                ];
-                far[i] = if r.max(g).max(b) > threshold { 255 } else { 0 };
+            let [red, green, blue, far] = &mut results;
+            for i in 0..CHUNK {
+                let pixel = <[Wide; N]>::gather(&colors, i);
+                let [r, g, b] = choose(pixel);
+                let [now_r, now_g, now_b] = pixel[0];
+                let apart = |a: i16, b: i16| a.wrapping_sub(b).wrapping_abs();
+                let apart = apart(r, now_r).max(apart(g, now_g)).max(apart(b, now_b));
+                far[i] = if apart > threshold { 255 } else { 0 };
+                red[i] = r;
+                green[i] = g;
+                blue[i] = b;
             }
-            let target = &mut median[done..done + length];
-            if let Ok(target) = <&mut [Rgb8; LANES]>::try_from(&mut *target) {
-                for i in 0..LANES {
-                    target[i] = [red[i], green[i], blue[i]];
-                }
-            } else {
-                for (i, pixel) in target.iter_mut().enumerate() {
-                    *pixel = [red[i], green[i], blue[i]];
-                }
+            for (i, pixel) in median.iter_mut().enumerate() {
+                *pixel = [red[i] as u8, green[i] as u8, blue[i] as u8];
             }
-            departs[done..done + length].copy_from_slice(&far[..length]);
-            done += length;
+            for (departs, far) in departs.iter_mut().zip(far.iter()) {
+                *departs = *far as u8;
+            }
+            at += n;
         }
     }
 }
 
 #[inline(always)]
-fn l1(a: &[Lane; 3], b: &[Lane; 3]) -> [u16; LANES] {
-    let mut sum = [0_u16; LANES];
-    for i in 0..LANES {
-        sum[i] =
-            u16::from(a[0][i].abs_diff(b[0][i])) + u16::from(a[1][i].abs_diff(b[1][i])) + u16::from(a[2][i].abs_diff(b[2][i]));
-    }
-    sum
+fn l1(a: Wide, b: Wide) -> i16 {
+    // Nothing can overflow; wrapping arithmetic says so to builds that check, which could not vectorize otherwise.
+    let apart = |c: usize| a[c].wrapping_sub(b[c]).wrapping_abs();
+    apart(0).wrapping_add(apart(1)).wrapping_add(apart(2))
 }
 
-/// Euclidean distance in units of 1/16 level: six of them still fit into 16 bits (6 · 441.7 · 16 = 42 400).
+/// Euclidean distance in units of 1/8 level: six of them still fit into 16 bits (6 · 441.7 · 8 = 21 200).
 #[inline(always)]
-fn l2(a: &[Lane; 3], b: &[Lane; 3]) -> [u16; LANES] {
-    let mut sum = [0_u16; LANES];
-    for i in 0..LANES {
-        let mut squares = 0_i32;
-        for channel in 0..3 {
-            let difference = i32::from(a[channel][i]) - i32::from(b[channel][i]);
-            squares += difference * difference;
-        }
-        sum[i] = ((squares as f32).sqrt() * 16.0) as i32 as u16;
-    }
-    sum
+fn l2(a: Wide, b: Wide) -> i16 {
+    let [r, g, b] = [0, 1, 2].map(|c| f32::from(a[c].wrapping_sub(b[c])));
+    // The integer in the low bits, as a plain conversion would give, but with a vector instruction.
+    ((r * r + g * g + b * b).sqrt() * 8.0 + 8_388_608.0).to_bits() as i16
 }
 
-#[inline(always)]
-fn vector<const N: usize>(window: &[[Lane; 3]; N], distance: impl Fn(&[Lane; 3], &[Lane; 3]) -> [u16; LANES]) -> [Lane; 3] {
-    let mut sums = [[0_u16; LANES]; N];
-    for i in 0..N {
-        for j in i + 1..N {
-            let apart = distance(&window[i], &window[j]);
-            for lane in 0..LANES {
-                sums[i][lane] += apart[lane];
-                sums[j][lane] += apart[lane];
+/// The colors one pixel had, newest first.
+pub trait Colors<const N: usize> {
+    /// Pixel `at` of each frame.
+    fn gather(planes: &[[[i16; CHUNK]; 3]; N], at: usize) -> Self;
+    /// The color with the smallest summed distance to the others.
+    fn vector_median(self, distance: impl Fn(Wide, Wide) -> i16) -> Wide;
+    /// The median of each channel.
+    fn marginal_median(self) -> Wide;
+}
+
+/// Written out for each length: loops over so few colors, left to the compiler, keep it from vectorizing over the pixels.
+/// The last list is an exchange network that leaves the median in the middle (Paeth, Graphics Gems I, 1990; Devillard 1998).
+macro_rules! colors {
+    ($n:literal, $middle:literal; [$($all:literal)*]; [$($later:literal)*]; [$(($i:literal, $j:literal)),*];
+        [$(($low:literal, $high:literal)),*]) => {
+        impl Colors<$n> for [Wide; $n] {
+            #[inline(always)]
+            fn gather(planes: &[[[i16; CHUNK]; 3]; $n], at: usize) -> Self {
+                [$([planes[$all][0][at], planes[$all][1][at], planes[$all][2][at]]),*]
+            }
+
+            #[inline(always)]
+            fn vector_median(self, distance: impl Fn(Wide, Wide) -> i16) -> Wide {
+                let mut sums = [0_i16; $n];
+                $(
+                    let apart = distance(self[$i], self[$j]);
+                    sums[$i] = sums[$i].wrapping_add(apart);
+                    sums[$j] = sums[$j].wrapping_add(apart);
+                )*
+                let mut least = sums[0];
+                let [mut r, mut g, mut b] = self[0];
+                $(
+                    let better = sums[$later] < least;
+                    least = if better { sums[$later] } else { least };
+                    r = if better { self[$later][0] } else { r };
+                    g = if better { self[$later][1] } else { g };
+                    b = if better { self[$later][2] } else { b };
+                )*
+                let _ = least;
+                [r, g, b]
+            }
+
+            #[inline(always)]
+            fn marginal_median(mut self) -> Wide {
+                $(
+                    let (a, b) = (self[$low], self[$high]);
+                    self[$low] = [a[0].min(b[0]), a[1].min(b[1]), a[2].min(b[2])];
+                    self[$high] = [a[0].max(b[0]), a[1].max(b[1]), a[2].max(b[2])];
+                )*
+                self[$middle]
             }
         }
-    }
-    let mut least = sums[0];
-    let mut chosen = [0_u16; LANES];
-    for i in 1..N {
-        for lane in 0..LANES {
-            let better = sums[i][lane] < least[lane];
-            chosen[lane] = if better { i as u16 } else { chosen[lane] };
-            least[lane] = if better { sums[i][lane] } else { least[lane] };
-        }
-    }
-    let mut index = [0_u8; LANES];
-    for lane in 0..LANES {
-        index[lane] = chosen[lane] as u8;
-    }
-    let mut median = window[0];
-    for i in 1..N {
-        for channel in 0..3 {
-            for lane in 0..LANES {
-                let this = index[lane] == i as u8;
-                median[channel][lane] = if this {
-                    window[i][channel][lane]
-                } else {
-                    median[channel][lane]
-                };
-            }
-        }
-    }
-    median
-}
-
-/// Exchange networks that leave the median in the middle (Paeth, Graphics Gems I, 1990; Devillard 1998).
-const NETWORK_3: &[(usize, usize)] = &[(0, 1), (1, 2), (0, 1)];
-const NETWORK_5: &[(usize, usize)] = &[(0, 1), (3, 4), (0, 3), (1, 4), (1, 2), (2, 3), (1, 2)];
-const NETWORK_7: &[(usize, usize)] = &[
-    (0, 5),
-    (0, 3),
-    (1, 6),
-    (2, 4),
-    (0, 1),
-    (3, 5),
-    (2, 6),
-    (2, 3),
-    (3, 6),
-    (4, 5),
-    (1, 4),
-    (1, 3),
-    (3, 4),
-];
-
-#[inline(always)]
-fn marginal<const N: usize>(window: &[[Lane; 3]; N]) -> [Lane; 3] {
-    let network = match N {
-        3 => NETWORK_3,
-        5 => NETWORK_5,
-        _ => NETWORK_7,
     };
-    let mut sorted = *window;
-    for &(low, high) in network {
-        for channel in 0..3 {
-            for lane in 0..LANES {
-                let (a, b) = (sorted[low][channel][lane], sorted[high][channel][lane]);
-                sorted[low][channel][lane] = a.min(b);
-                sorted[high][channel][lane] = a.max(b);
-            }
-        }
-    }
-    sorted[N / 2]
 }
+
+colors!(3, 1; [0 1 2]; [1 2]; [(0, 1), (0, 2), (1, 2)];
+    [(0, 1), (1, 2), (0, 1)]);
+colors!(5, 2; [0 1 2 3 4]; [1 2 3 4]; [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (1, 3), (1, 4), (2, 3), (2, 4), (3, 4)];
+    [(0, 1), (3, 4), (0, 3), (1, 4), (1, 2), (2, 3), (1, 2)]);
+colors!(7, 3; [0 1 2 3 4 5 6]; [1 2 3 4 5 6]; [(0, 1), (0, 2), (0, 3), (0, 4), (0, 5), (0, 6), (1, 2), (1, 3), (1, 4), (1, 5), (1, 6), (2, 3), (2, 4), (2, 5), (2, 6), (3, 4), (3, 5), (3, 6), (4, 5), (4, 6), (5, 6)];
+    [(0, 5), (0, 3), (1, 6), (2, 4), (0, 1), (3, 5), (2, 6), (2, 3), (3, 6), (4, 5), (1, 4), (1, 3), (3, 4)]);
 
 #[cfg(test)]
 mod tests {
@@ -218,7 +196,7 @@ mod tests {
                     let d = [0, 1, 2].map(|c| u32::from(a[c].abs_diff(b[c])));
                     match distance {
                         Distance::L1 => d.iter().sum(),
-                        Distance::L2 => (d.map(|d| (d * d) as f32).iter().sum::<f32>().sqrt() * 16.0) as u32,
+                        Distance::L2 => (d.map(|d| (d * d) as f32).iter().sum::<f32>().sqrt() * 8.0).round_ties_even() as u32,
                     }
                 })
                 .sum();
@@ -237,7 +215,10 @@ mod tests {
         })
     }
 
-    fn agrees<const N: usize>(spread: u8, pixels: usize, seed: u64) {
+    fn agrees<const N: usize>(spread: u8, pixels: usize, seed: u64)
+    where
+        [Wide; N]: Colors<N>,
+    {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let planes: [Planes; N] = std::array::from_fn(|_| Planes {
             color: std::array::from_fn(|_| (0..pixels).map(|_| random.random_range(0..=spread)).collect()),
