@@ -29,7 +29,12 @@ fn camera() -> CameraModel {
     CameraModel {
         width: WIDTH,
         height: HEIGHT,
-        intrinsics: Intrinsics { fx: 216.0, fy: 215.0, cx: 121.3, cy: 78.2 },
+        intrinsics: Intrinsics {
+            fx: 216.0,
+            fy: 215.0,
+            cx: 121.3,
+            cy: 78.2,
+        },
         distortion: Distortion::None,
     }
 }
@@ -108,7 +113,13 @@ fn survey() -> (LightField, Vec<f64>) {
         let exposure = 1.0 + 0.12 * (f64::from(i) * 1.3).sin();
         let pose = pose(radius * angle.cos(), radius * angle.sin(), 5.0 * (f64::from(i) * 0.7).sin());
         let (image, _) = shot(&pose, exposure, u64::from(i));
-        light_field.views.push(view_of(i * 3, Timestamp::from_seconds(0.04 * f64::from(i)), &image, &camera(), pose));
+        light_field.views.push(view_of(
+            i * 3,
+            Timestamp::from_seconds(0.04 * f64::from(i)),
+            &image,
+            &camera(),
+            pose,
+        ));
         exposures.push(exposure);
     }
     (light_field, exposures)
@@ -143,10 +154,19 @@ fn depth_gains_pictures_and_files() {
     assert!(rms < 0.3, "depth error {rms} mm rms over {count} pixels");
 
     // Exposures come back up to a common factor; sRGB values go with exposure^(1/2.2).
-    let relative: Vec<f64> = light_field.views.iter().zip(&exposures).map(|(v, e)| f64::from(v.gain[1]).ln() + e.ln() / 2.2).collect();
+    let relative: Vec<f64> = light_field
+        .views
+        .iter()
+        .zip(&exposures)
+        .map(|(v, e)| f64::from(v.gain[1]).ln() + e.ln() / 2.2)
+        .collect();
     let mean = relative.iter().sum::<f64>() / relative.len() as f64;
     assert!(relative.iter().all(|r| (r - mean).abs() < 0.02), "{relative:?}");
-    assert!((light_field.shading.falloff - 2.0 / 2.2).abs() < 0.25, "{:?}", light_field.shading);
+    assert!(
+        (light_field.shading.falloff - 2.0 / 2.2).abs() < 0.25,
+        "{:?}",
+        light_field.shading
+    );
 
     let mut renderer = Renderer::new(&light_field);
     let (mut picture, mut valid) = (Image::filled(0, 0, [0; 3]), Image::filled(0, 0, 0));
@@ -161,7 +181,11 @@ fn depth_gains_pictures_and_files() {
     assert!(psnr > 33.0, "{psnr} dB");
 
     let evaluation = leave_one_out(&light_field, &Silent);
-    assert!(evaluation.mean.texture_psnr > 33.0 && evaluation.mean.ssim > 0.9, "{:?}", evaluation.mean);
+    assert!(
+        evaluation.mean.texture_psnr > 33.0 && evaluation.mean.ssim > 0.9,
+        "{:?}",
+        evaluation.mean
+    );
 
     let folder = tempfile::tempdir().unwrap();
     save(&light_field, folder.path(), &Silent).unwrap();
@@ -177,8 +201,17 @@ fn comes_back(light_field: &LightField, folder: &Path) {
     assert_eq!(back.shading, light_field.shading);
     assert_eq!(back.surface.triangles, light_field.surface.triangles);
     for (a, b) in back.views.iter().zip(&light_field.views) {
-        assert_eq!((a.frame_number, &a.image, &a.confidence, a.gain, a.exposed_at), (b.frame_number, &b.image, &b.confidence, b.gain, b.exposed_at));
-        assert!(a.depth.pixels().iter().zip(b.depth.pixels()).all(|(a, b)| (a - b).abs() <= 0.0051));
+        assert_eq!(
+            (a.frame_number, &a.image, &a.confidence, a.gain, a.exposed_at),
+            (b.frame_number, &b.image, &b.confidence, b.gain, b.exposed_at)
+        );
+        assert!(
+            a.depth
+                .pixels()
+                .iter()
+                .zip(b.depth.pixels())
+                .all(|(a, b)| (a - b).abs() <= 0.0051)
+        );
         let apart = a.world_from_camera.inverse() * b.world_from_camera;
         assert!(apart.translation().norm() < 1e-9 && apart.rotation().angle() < 1e-7);
     }
@@ -186,7 +219,12 @@ fn comes_back(light_field: &LightField, folder: &Path) {
 
 fn faults_are_named(folder: &Path) {
     let nothing = tempfile::tempdir().unwrap();
-    assert!(read(nothing.path(), &Silent).unwrap_err().to_string().contains("light-field build"));
+    assert!(
+        read(nothing.path(), &Silent)
+            .unwrap_err()
+            .to_string()
+            .contains("light-field build")
+    );
     let depth = folder.join("depth/000006.png");
     let bytes = fs::read(&depth).unwrap();
     fs::write(&depth, &bytes[..bytes.len() / 2]).unwrap();

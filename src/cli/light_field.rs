@@ -38,8 +38,10 @@ const MAX_GAP: Span = Span(200_000_000);
 
 /// Light fields: build from a survey, look at, render from, evaluate.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  endofield light-field build survey -o lf\n  endofield light-field evaluate lf\n  \
-    endofield light-field render lf --poses camera_poses.tum --camera camera.yaml -o pictures")]
+#[command(
+    after_help = "Examples:\n  endofield light-field build survey -o lf\n  endofield light-field evaluate lf\n  \
+    endofield light-field render lf --poses camera_poses.tum --camera camera.yaml -o pictures"
+)]
 pub struct Args {
     #[command(subcommand)]
     command: Command,
@@ -159,7 +161,12 @@ impl PosePrior for Arm {
 }
 
 /// Builds a light field from a survey recording or a COLMAP model in `source`, without writing it.
-pub fn built(source: &Path, views: usize, refine: bool, progress: &dyn Progress) -> anyhow::Result<(LightField, serde_json::Value)> {
+pub fn built(
+    source: &Path,
+    views: usize,
+    refine: bool,
+    progress: &dyn Progress,
+) -> anyhow::Result<(LightField, serde_json::Value)> {
     let (light_field, report) = if model_folder(source).is_some() && !source.join("poses.tum").is_file() {
         from_model(source, progress)?
     } else {
@@ -209,7 +216,12 @@ fn from_model(source: &Path, progress: &dyn Progress) -> anyhow::Result<(LightFi
     Ok((light_field, report))
 }
 
-fn from_recording(source: &Path, views: usize, refine: bool, progress: &dyn Progress) -> anyhow::Result<(LightField, BuildReport)> {
+fn from_recording(
+    source: &Path,
+    views: usize,
+    refine: bool,
+    progress: &dyn Progress,
+) -> anyhow::Result<(LightField, BuildReport)> {
     let recording = Recording::open(source)?;
     let what = "a light field needs camera.yaml, poses.tum (or joints.csv) and hand_eye.yaml beside the video";
     let (Some(camera), Some(trajectory), Some(hand_eye)) = (&recording.camera, &recording.trajectory, &recording.hand_eye) else {
@@ -217,7 +229,10 @@ fn from_recording(source: &Path, views: usize, refine: bool, progress: &dyn Prog
         bail!("{}: {what}; {}", source.display(), missing.join("; "));
     };
     let known_offset = hand_eye.time_offset;
-    let arm = Arm { poses: trajectory.clone(), hand_eye: hand_eye.clone() };
+    let arm = Arm {
+        poses: trajectory.clone(),
+        hand_eye: hand_eye.clone(),
+    };
     let mut seconds = Phases::default();
 
     let began = MonotonicClock.now();
@@ -248,7 +263,10 @@ fn from_recording(source: &Path, views: usize, refine: bool, progress: &dyn Prog
                 exposed_at: view.exposed_at,
             })
             .collect();
-        let settings = survey::Settings { known_time_offset_ms: known_offset.map(|o| o.milliseconds()), ..Default::default() };
+        let settings = survey::Settings {
+            known_time_offset_ms: known_offset.map(|o| o.milliseconds()),
+            ..Default::default()
+        };
         let refined = survey::refine(&frames, &camera.pinhole(), &arm, &settings, progress)?;
         let mut kept = Vec::with_capacity(prepared.len());
         for (mut view, pose) in prepared.into_iter().zip(&refined.world_from_camera) {
@@ -258,7 +276,14 @@ fn from_recording(source: &Path, views: usize, refine: bool, progress: &dyn Prog
             }
         }
         prepared = kept;
-        let points = refined.points.into_iter().map(|p| SparsePoint { position: p.position, observations: p.observations }).collect();
+        let points = refined
+            .points
+            .into_iter()
+            .map(|p| SparsePoint {
+                position: p.position,
+                observations: p.observations,
+            })
+            .collect();
         (points, Some(refined.report), refined.time_offset)
     } else {
         (Vec::new(), None, known_offset.unwrap_or_default())
@@ -270,7 +295,15 @@ fn from_recording(source: &Path, views: usize, refine: bool, progress: &dyn Prog
         views: prepared,
         points,
         time_offset,
-        recipe: format!("survey {}, {}", source.display(), if refine { "poses refined by the pictures" } else { "the arm's poses" }),
+        recipe: format!(
+            "survey {}, {}",
+            source.display(),
+            if refine {
+                "poses refined by the pictures"
+            } else {
+                "the arm's poses"
+            }
+        ),
         ..LightField::default()
     };
     let surface = build::complete(&mut light_field, &BuildSettings::default(), progress)?;
@@ -320,8 +353,17 @@ fn selected_pictures(recording: &Recording, arm: &Arm, views: usize, progress: &
         progress.advance(1);
     }
     progress.end();
-    let chosen = select_views(&candidates, &SelectionSettings { target_views: views, ..SelectionSettings::default() });
-    let wanted: Vec<(u32, Timestamp)> = chosen.iter().map(|&i| (candidates[i].frame_number, candidates[i].exposed_at)).collect();
+    let chosen = select_views(
+        &candidates,
+        &SelectionSettings {
+            target_views: views,
+            ..SelectionSettings::default()
+        },
+    );
+    let wanted: Vec<(u32, Timestamp)> = chosen
+        .iter()
+        .map(|&i| (candidates[i].frame_number, candidates[i].exposed_at))
+        .collect();
     let mut pictures = Vec::with_capacity(wanted.len());
     let mut reader = VideoReader::open(&input)?;
     progress.begin("fetch the chosen views", wanted.len() as u64);
@@ -340,26 +382,62 @@ fn selected_pictures(recording: &Recording, arm: &Arm, views: usize, progress: &
 fn info(folder: &Path, progress: &dyn Progress) -> anyhow::Result<()> {
     let light_field = build::open(folder, &BuildSettings::default(), progress)?;
     let views = &light_field.views;
-    let Some(first) = views.first() else { bail!("{}: no views", folder.display()) };
+    let Some(first) = views.first() else {
+        bail!("{}: no views", folder.display())
+    };
     let centers: Vec<_> = views.iter().map(|v| v.world_from_camera.translation()).collect();
     let path: f64 = centers.windows(2).map(|pair| (pair[1] - pair[0]).norm()).sum();
-    let mut depths: Vec<f32> = views.iter().flat_map(|v| v.depth.pixels().iter().step_by(97)).copied().filter(|z| *z > 0.0).collect();
+    let mut depths: Vec<f32> = views
+        .iter()
+        .flat_map(|v| v.depth.pixels().iter().step_by(97))
+        .copied()
+        .filter(|z| *z > 0.0)
+        .collect();
     depths.sort_by(f32::total_cmp);
-    let depth = |share: f64| depths.get(((depths.len().max(1) - 1) as f64 * share) as usize).copied().unwrap_or(0.0);
+    let depth = |share: f64| {
+        depths
+            .get(((depths.len().max(1) - 1) as f64 * share) as usize)
+            .copied()
+            .unwrap_or(0.0)
+    };
     let confident = views.iter().flat_map(|v| v.confidence.pixels()).filter(|&&c| c > 127).count() as f64;
     let all = views.iter().map(|v| v.confidence.pixels().len()).sum::<usize>() as f64;
-    let (low, high) = views.iter().fold((f32::MAX, 0.0_f32), |(low, high), v| (low.min(v.gain[1]), high.max(v.gain[1])));
+    let (low, high) = views.iter().fold((f32::MAX, 0.0_f32), |(low, high), v| {
+        (low.min(v.gain[1]), high.max(v.gain[1]))
+    });
     say(&format!("{}\n  made by        {}", folder.display(), light_field.recipe));
-    say(&format!("  views          {} of {}×{}, frames {}–{}", views.len(), first.camera.width, first.camera.height, first.frame_number, views[views.len() - 1].frame_number));
-    say(&format!("  focal length   {:.1} × {:.1} px", first.camera.intrinsics.fx, first.camera.intrinsics.fy));
+    say(&format!(
+        "  views          {} of {}×{}, frames {}–{}",
+        views.len(),
+        first.camera.width,
+        first.camera.height,
+        first.frame_number,
+        views[views.len() - 1].frame_number
+    ));
+    say(&format!(
+        "  focal length   {:.1} × {:.1} px",
+        first.camera.intrinsics.fx, first.camera.intrinsics.fy
+    ));
     say(&format!("  path           {path:.1} mm"));
-    say(&format!("  depth          {:.1} / {:.1} / {:.1} mm (5 %, median, 95 %)", depth(0.05), depth(0.5), depth(0.95)));
-    say(&format!("  surface        {} vertices, {} triangles", light_field.surface.vertices.len(), light_field.surface.triangles.len()));
+    say(&format!(
+        "  depth          {:.1} / {:.1} / {:.1} mm (5 %, median, 95 %)",
+        depth(0.05),
+        depth(0.5),
+        depth(0.95)
+    ));
+    say(&format!(
+        "  surface        {} vertices, {} triangles",
+        light_field.surface.vertices.len(),
+        light_field.surface.triangles.len()
+    ));
     say(&format!("  scene points   {}", light_field.points.len()));
     say(&format!("  confident      {:.1} % of all pixels", 100.0 * confident / all));
     say(&format!("  gains          {low:.2}–{high:.2} (green)"));
     let lamp = light_field.shading;
-    say(&format!("  lamp           distance^-{:.2}, vignetting {:.2} ρ² {:+.2} ρ⁴", lamp.falloff, lamp.vignetting[0], lamp.vignetting[1]));
+    say(&format!(
+        "  lamp           distance^-{:.2}, vignetting {:.2} ρ² {:+.2} ρ⁴",
+        lamp.falloff, lamp.vignetting[0], lamp.vignetting[1]
+    ));
     say(&format!("  time offset    {:.1} ms", light_field.time_offset.milliseconds()));
     Ok(())
 }
@@ -372,13 +450,22 @@ fn render(args: &RenderArgs, force: bool, progress: &dyn Progress) -> anyhow::Re
     let inverted = match poses.transform.as_deref() {
         None | Some("T_world_camera" | "T_base_camera") => false,
         Some("T_camera_world" | "T_camera_base") => true,
-        Some(other) => bail!("{}: expected camera poses (`# T_world_camera, mm`), found {other}", args.poses.display()),
+        Some(other) => bail!(
+            "{}: expected camera poses (`# T_world_camera, mm`), found {other}",
+            args.poses.display()
+        ),
     };
     let masks = args.output.join("mask");
     fs::create_dir_all(&masks).with_context(|| format!("cannot make {}", masks.display()))?;
     progress.begin("render", poses.poses.len() as u64);
     poses.poses.par_iter().enumerate().try_for_each_init(
-        || (Renderer::new(&light_field), Image::filled(0, 0, [0_u8; 3]), Image::filled(0, 0, 0_u8)),
+        || {
+            (
+                Renderer::new(&light_field),
+                Image::filled(0, 0, [0_u8; 3]),
+                Image::filled(0, 0, 0_u8),
+            )
+        },
         |(renderer, picture, mask), (index, (_, pose))| {
             if progress.stopping() {
                 bail!("stopped before it was done");
@@ -405,7 +492,12 @@ fn evaluate(folder: &Path, json: Option<&Path>, progress: &dyn Progress) -> anyh
     let line = |name: &str, v: &crate::light_field::evaluate::ViewScore| {
         say(&format!(
             "{name:>8}  {:6.2}  {:6.4} | {:30.2}  {:6.4}   {:6.2} | {:5.1} %",
-            v.psnr, v.ssim, v.psnr_without_specular, v.ssim_without_specular, v.texture_psnr, 100.0 * v.covered
+            v.psnr,
+            v.ssim,
+            v.psnr_without_specular,
+            v.ssim_without_specular,
+            v.texture_psnr,
+            100.0 * v.covered
         ));
     };
     for view in &evaluation.views {
@@ -413,7 +505,8 @@ fn evaluate(folder: &Path, json: Option<&Path>, progress: &dyn Progress) -> anyh
     }
     line("mean", &evaluation.mean);
     if let Some(path) = json {
-        fs::write(path, serde_json::to_string_pretty(&evaluation)?).with_context(|| format!("cannot write {}", path.display()))?;
+        fs::write(path, serde_json::to_string_pretty(&evaluation)?)
+            .with_context(|| format!("cannot write {}", path.display()))?;
     }
     Ok(())
 }
@@ -421,10 +514,22 @@ fn evaluate(folder: &Path, json: Option<&Path>, progress: &dyn Progress) -> anyh
 fn print_report(report: &serde_json::Value) {
     let number = |pointer: &str| report.pointer(pointer).and_then(serde_json::Value::as_f64);
     let count = |pointer: &str| number(pointer).unwrap_or(0.0) as u64;
-    say(&format!("views            {}, scene points {}", count("/views"), count("/points")));
-    if let (Some(before), Some(after)) = (number("/survey/prior_reprojection_px"), number("/survey/refined_reprojection_px")) {
-        say(&format!("reprojection     {before:.2} px with the arm's poses, {after:.2} px refined"));
-        say(&format!("time offset      {:.1} ms", number("/survey/time_offset_ms").unwrap_or(0.0)));
+    say(&format!(
+        "views            {}, scene points {}",
+        count("/views"),
+        count("/points")
+    ));
+    if let (Some(before), Some(after)) = (
+        number("/survey/prior_reprojection_px"),
+        number("/survey/refined_reprojection_px"),
+    ) {
+        say(&format!(
+            "reprojection     {before:.2} px with the arm's poses, {after:.2} px refined"
+        ));
+        say(&format!(
+            "time offset      {:.1} ms",
+            number("/survey/time_offset_ms").unwrap_or(0.0)
+        ));
     }
     say(&format!(
         "surface          {} triangles from {} depth maps, under {:.1} % of the confident pixels",
@@ -437,10 +542,22 @@ fn print_report(report: &serde_json::Value) {
         100.0 * number("/surface/brightness_spread_before").unwrap_or(0.0),
         100.0 * number("/surface/brightness_spread_after").unwrap_or(0.0)
     ));
-    let phases = ["decode_and_select_s", "undistort_and_detect_s", "refine_s", "depth_and_surface_s", "write_s"];
+    let phases = [
+        "decode_and_select_s",
+        "undistort_and_detect_s",
+        "refine_s",
+        "depth_and_surface_s",
+        "write_s",
+    ];
     let parts: Vec<String> = phases
         .iter()
-        .map(|p| format!("{} {:.1}", p.trim_end_matches("_s").replace('_', " "), number(&format!("/seconds/{p}")).unwrap_or(0.0)))
+        .map(|p| {
+            format!(
+                "{} {:.1}",
+                p.trim_end_matches("_s").replace('_', " "),
+                number(&format!("/seconds/{p}")).unwrap_or(0.0)
+            )
+        })
         .collect();
     say(&format!("seconds          {}", parts.join(", ")));
 }
@@ -448,7 +565,10 @@ fn print_report(report: &serde_json::Value) {
 fn refuse_overwriting(path: &Path, force: bool) -> anyhow::Result<()> {
     let occupied = path.is_file() || path.read_dir().is_ok_and(|mut entries| entries.next().is_some());
     if occupied && !force {
-        bail!("{}: exists already and is not overwritten; remove it, choose another name or pass --force", path.display());
+        bail!(
+            "{}: exists already and is not overwritten; remove it, choose another name or pass --force",
+            path.display()
+        );
     }
     Ok(())
 }

@@ -85,14 +85,21 @@ pub fn open(folder: &Path, settings: &BuildSettings, progress: &dyn Progress) ->
 
 /// Confidence maps for views that have none but their image field.
 pub fn make_confidence(light_field: &mut LightField) {
-    light_field.views.par_iter_mut().for_each(|view| view.confidence = confidence_of(&view.image, &view.confidence));
+    light_field
+        .views
+        .par_iter_mut()
+        .for_each(|view| view.confidence = confidence_of(&view.image, &view.confidence));
 }
 
 /// Surface, per-view depth and gains for views whose pictures, confidence and poses stand.
 ///
 /// Two passes: a sweep from nothing gives a first surface; around it, with windows that follow its slant, a second and finer
 /// one gives the surface that stays.
-pub fn complete(light_field: &mut LightField, settings: &BuildSettings, progress: &dyn Progress) -> Result<CompletionReport, LightFieldError> {
+pub fn complete(
+    light_field: &mut LightField,
+    settings: &BuildSettings,
+    progress: &dyn Progress,
+) -> Result<CompletionReport, LightFieldError> {
     if light_field.views.len() < 2 {
         return Err(LightFieldError::TooLittle(format!(
             "expected at least 2 views to find depth, found {}; survey the scene with a moving camera",
@@ -117,7 +124,9 @@ pub fn complete(light_field: &mut LightField, settings: &BuildSettings, progress
         ));
     };
     let Some(surface) = fuse(&maps, &settings.surface) else {
-        return Err(LightFieldError::TooLittle("the second depth pass found no surface; are the poses right?".into()));
+        return Err(LightFieldError::TooLittle(
+            "the second depth pass found no surface; are the poses right?".into(),
+        ));
     };
     light_field.surface = surface;
     rasterize_depths(light_field);
@@ -188,4 +197,3 @@ fn coverage(light_field: &LightField) -> f64 {
     }
     covered as f64 / all.max(1) as f64
 }
-

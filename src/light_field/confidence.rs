@@ -43,7 +43,10 @@ pub fn confidence_of(image: &Image<Rgb8>, field: &Mask) -> Mask {
         .collect();
     chamfer(&mut silent, width, height);
     let (from, to) = (SILENT_PX * scale, FULL_PX * scale);
-    let voice = silent.iter().map(|d| (((d - from) / (to - from)).clamp(0.0, 1.0) * 255.0) as u8).collect();
+    let voice = silent
+        .iter()
+        .map(|d| (((d - from) / (to - from)).clamp(0.0, 1.0) * 255.0) as u8)
+        .collect();
     Image::from_vec(width, height, voice).unwrap_or_else(|| field.clone())
 }
 
@@ -75,19 +78,22 @@ fn chamfer(distance: &mut [f32], width: usize, height: usize) {
 /// Mean over a square window, cut at the border.
 fn box_mean(values: &[f32], width: usize, height: usize, radius: usize) -> Vec<f32> {
     let mut across = vec![0.0_f32; values.len()];
-    across.par_chunks_mut(width).zip(values.par_chunks(width)).for_each(|(out, row)| {
-        let mut sum: f64 = row[..radius.min(width)].iter().map(|&v| f64::from(v)).sum();
-        for x in 0..width {
-            if x + radius < width {
-                sum += f64::from(row[x + radius]);
+    across
+        .par_chunks_mut(width)
+        .zip(values.par_chunks(width))
+        .for_each(|(out, row)| {
+            let mut sum: f64 = row[..radius.min(width)].iter().map(|&v| f64::from(v)).sum();
+            for x in 0..width {
+                if x + radius < width {
+                    sum += f64::from(row[x + radius]);
+                }
+                if x > radius {
+                    sum -= f64::from(row[x - radius - 1]);
+                }
+                let count = (x + radius + 1).min(width) - x.saturating_sub(radius);
+                out[x] = (sum / count as f64) as f32;
             }
-            if x > radius {
-                sum -= f64::from(row[x - radius - 1]);
-            }
-            let count = (x + radius + 1).min(width) - x.saturating_sub(radius);
-            out[x] = (sum / count as f64) as f32;
-        }
-    });
+        });
     let mut out = vec![0.0_f32; values.len()];
     let mut sums = vec![0.0_f64; width];
     for y in 0..radius.min(height) {

@@ -72,7 +72,14 @@ fn score(light_field: &LightField, renderer: &mut Renderer, index: usize) -> Vie
     let view = &light_field.views[index];
     let (mut rendered, mut valid) = (Image::filled(0, 0, [0; 3]), Image::filled(0, 0, 0));
     renderer.exclude(Some(index));
-    renderer.render_on_depth(light_field, &view.camera, &view.world_from_camera, &view.depth, &mut rendered, &mut valid);
+    renderer.render_on_depth(
+        light_field,
+        &view.camera,
+        &view.world_from_camera,
+        &view.depth,
+        &mut rendered,
+        &mut valid,
+    );
     renderer.exclude(None);
     // Back to this view's own exposure.
     for pixel in rendered.pixels_mut() {

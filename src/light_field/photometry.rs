@@ -53,7 +53,10 @@ pub fn estimate(views: &[View], surface: &Mesh<World>) -> Photometry {
         theta.x = theta.x.clamp(0.0, 1.6);
         (exposure, theta) = solve(&points, n, Some(theta.x), |o| everything(o, o.log));
     }
-    let shading = LampShading { falloff: theta.x as f32, vignetting: [theta.y as f32, theta.z as f32] };
+    let shading = LampShading {
+        falloff: theta.x as f32,
+        vignetting: [theta.y as f32, theta.z as f32],
+    };
     let mut gains = vec![[1.0_f32; 3]; n];
     for channel in 0..3 {
         // What the channel deviates from the mean, with the lamp's part known and gains shrunk to the common one.
@@ -63,7 +66,12 @@ pub fn estimate(views: &[View], surface: &Mesh<World>) -> Photometry {
         }
     }
     let after = spread(&points, |o| everything(o, o.log) + exposure[o.view] - theta.dot(&o.x));
-    Photometry { gains, shading, spread_before: before, spread_after: after }
+    Photometry {
+        gains,
+        shading,
+        spread_before: before,
+        spread_after: after,
+    }
 }
 
 fn observed(views: &[View], surface: &Mesh<World>) -> Vec<Vec<Observation>> {
@@ -74,7 +82,9 @@ fn observed(views: &[View], surface: &Mesh<World>) -> Vec<Vec<Observation>> {
         let mut seen = Vec::new();
         for (index, (view, camera_from_world)) in views.iter().zip(&cameras).enumerate() {
             let local = *camera_from_world * *vertex;
-            let Some(pixel) = view.camera.project(local).filter(|&p| view.camera.contains(p, 3.0)) else { continue };
+            let Some(pixel) = view.camera.project(local).filter(|&p| view.camera.contains(p, 3.0)) else {
+                continue;
+            };
             let (x, y) = (pixel.x.round() as usize, pixel.y.round() as usize);
             let depth = f64::from(view.depth.at(x, y));
             if view.confidence.at(x, y) < 250 || depth <= 0.0 || local.coords.z > depth * 1.01 {
@@ -111,7 +121,12 @@ fn mean_color(view: &View, pixel: Pixel) -> [f32; 3] {
 }
 
 /// Exposures e (mean 0) and lamp parameters θ; with `fixed` the falloff is given and, when 0, the whole lamp is left out.
-fn solve(points: &[Vec<Observation>], views: usize, fixed: Option<f64>, value: impl Fn(&Observation) -> f64) -> (Vec<f64>, Vector3<f64>) {
+fn solve(
+    points: &[Vec<Observation>],
+    views: usize,
+    fixed: Option<f64>,
+    value: impl Fn(&Observation) -> f64,
+) -> (Vec<f64>, Vector3<f64>) {
     let unknowns = views + 3;
     let mut solution = DVector::<f64>::zeros(unknowns);
     if let Some(falloff) = fixed {
@@ -129,11 +144,24 @@ fn solve(points: &[Vec<Observation>], views: usize, fixed: Option<f64>, value: i
         }
         for seen in points {
             // Row of an observation: +1 at its view, −x at the lamp; value y: e − θx + y = a.
-            let rest: Vec<f64> =
-                seen.iter().map(|o| value(o) + solution[o.view] - Vector3::new(solution[views], solution[views + 1], solution[views + 2]).dot(&o.x)).collect();
+            let rest: Vec<f64> = seen
+                .iter()
+                .map(|o| {
+                    value(o) + solution[o.view]
+                        - Vector3::new(solution[views], solution[views + 1], solution[views + 2]).dot(&o.x)
+                })
+                .collect();
             let center = median(rest.clone());
-            let weight: Vec<f64> =
-                rest.iter().map(|r| if round == 0 { 1.0 } else { (HUBER / (r - center).abs().max(1e-12)).min(1.0) }).collect();
+            let weight: Vec<f64> = rest
+                .iter()
+                .map(|r| {
+                    if round == 0 {
+                        1.0
+                    } else {
+                        (HUBER / (r - center).abs().max(1e-12)).min(1.0)
+                    }
+                })
+                .collect();
             let total: f64 = weight.iter().sum();
             let mean_y: f64 = seen.iter().zip(&weight).map(|(o, w)| w * value(o)).sum::<f64>() / total;
             let mean_x: Vector3<f64> = seen.iter().zip(&weight).map(|(o, w)| o.x * *w).sum::<Vector3<f64>>() / total;
@@ -159,7 +187,10 @@ fn solve(points: &[Vec<Observation>], views: usize, fixed: Option<f64>, value: i
     }
     let mean = solution.rows(0, views).sum() / views.max(1) as f64;
     let exposure = (0..views).map(|i| solution[i] - mean).collect();
-    (exposure, Vector3::new(solution[views], solution[views + 1], solution[views + 2]))
+    (
+        exposure,
+        Vector3::new(solution[views], solution[views + 1], solution[views + 2]),
+    )
 }
 
 fn spread(points: &[Vec<Observation>], value: impl Fn(&Observation) -> f64) -> f64 {

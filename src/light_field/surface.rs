@@ -30,7 +30,12 @@ pub struct SurfaceSettings {
 
 impl Default for SurfaceSettings {
     fn default() -> Self {
-        Self { triangles: 60_000, max_voxels: 6_000_000, truncation_voxels: 4.0, smallest_piece: 0.01 }
+        Self {
+            triangles: 60_000,
+            max_voxels: 6_000_000,
+            truncation_voxels: 4.0,
+            smallest_piece: 0.01,
+        }
     }
 }
 
@@ -73,7 +78,10 @@ pub fn fuse(maps: &[DepthMap], settings: &SurfaceSettings) -> Option<Mesh<World>
     let layer = grid.size[0] * grid.size[1];
     let truncation = settings.truncation_voxels * grid.voxel;
     let needed = if maps.len() >= 2 { 2 } else { 1 };
-    voxels.par_chunks_mut(layer).enumerate().for_each(|(z, layer)| integrate(&grid, z, maps, truncation, layer));
+    voxels
+        .par_chunks_mut(layer)
+        .enumerate()
+        .for_each(|(z, layer)| integrate(&grid, z, maps, truncation, layer));
     let voxels = smoothed(&grid, &voxels);
     let mesh = surface_net(&grid, &voxels, needed);
     (!mesh.triangles.is_empty()).then(|| without_small_pieces(&mesh, settings.smallest_piece))
@@ -150,7 +158,9 @@ fn integrate(grid: &Grid, z: usize, maps: &[DepthMap], truncation: f32, layer: &
                 if !(u >= 0.0 && v >= 0.0 && u <= right && v <= bottom) {
                     continue;
                 }
-                let Some((seen, weight)) = depth_at(map, u, v, truncation) else { continue };
+                let Some((seen, weight)) = depth_at(map, u, v, truncation) else {
+                    continue;
+                };
                 let distance = (seen - p.z) / truncation;
                 if distance < -1.0 {
                     continue;
@@ -213,10 +223,30 @@ fn smoothed(grid: &Grid, voxels: &[Voxel]) -> Vec<Voxel> {
     current
 }
 
-const CORNERS: [[usize; 3]; 8] =
-    [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]];
-const EDGES: [[usize; 2]; 12] =
-    [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
+const CORNERS: [[usize; 3]; 8] = [
+    [0, 0, 0],
+    [1, 0, 0],
+    [0, 1, 0],
+    [1, 1, 0],
+    [0, 0, 1],
+    [1, 0, 1],
+    [0, 1, 1],
+    [1, 1, 1],
+];
+const EDGES: [[usize; 2]; 12] = [
+    [0, 1],
+    [2, 3],
+    [4, 5],
+    [6, 7],
+    [0, 2],
+    [1, 3],
+    [4, 6],
+    [5, 7],
+    [0, 4],
+    [1, 5],
+    [2, 6],
+    [3, 7],
+];
 
 fn surface_net(grid: &Grid, voxels: &[Voxel], needed: u32) -> Mesh<World> {
     let [nx, ny, nz] = grid.size;
@@ -246,7 +276,8 @@ fn surface_net(grid: &Grid, voxels: &[Voxel], needed: u32) -> Mesh<World> {
                 }
                 let local = sum / crossings + Vector3::new(x as f32, y as f32, z as f32);
                 vertex_of[grid.index(x, y, z)] = mesh.vertices.len() as u32;
-                mesh.vertices.push(Point::from_coords(grid.world(local.x, local.y, local.z).cast()));
+                mesh.vertices
+                    .push(Point::from_coords(grid.world(local.x, local.y, local.z).cast()));
             }
         }
     }
@@ -267,8 +298,13 @@ fn surface_net(grid: &Grid, voxels: &[Voxel], needed: u32) -> Mesh<World> {
                         continue;
                     }
                     // Counter-clockwise seen from the free side.
-                    let [a, b, c, d] = if here.distance < 0.0 { quad } else { [quad[3], quad[2], quad[1], quad[0]] };
-                    let span = |i: u32, j: u32| (mesh.vertices[i as usize].coords - mesh.vertices[j as usize].coords).norm_squared();
+                    let [a, b, c, d] = if here.distance < 0.0 {
+                        quad
+                    } else {
+                        [quad[3], quad[2], quad[1], quad[0]]
+                    };
+                    let span =
+                        |i: u32, j: u32| (mesh.vertices[i as usize].coords - mesh.vertices[j as usize].coords).norm_squared();
                     if span(a, c) <= span(b, d) {
                         mesh.triangles.extend([[a, b, c], [a, c, d]]);
                     } else {
@@ -331,8 +367,16 @@ mod tests {
 
     /// Exact depth of a sphere of radius 20 mm at (0, 0, 80), from a camera `x` mm to the side that looks at it.
     fn map(x: f64) -> DepthMap {
-        let intrinsics = Intrinsics { fx: 200.0, fy: 200.0, cx: 79.5, cy: 59.5 };
-        let pose = Transform::new(UnitQuaternion::from_scaled_axis(Vector3::new(0.0, -(x / 80.0).atan(), 0.0)), Vector3::new(x, 0.0, 0.0));
+        let intrinsics = Intrinsics {
+            fx: 200.0,
+            fy: 200.0,
+            cx: 79.5,
+            cy: 59.5,
+        };
+        let pose = Transform::new(
+            UnitQuaternion::from_scaled_axis(Vector3::new(0.0, -(x / 80.0).atan(), 0.0)),
+            Vector3::new(x, 0.0, 0.0),
+        );
         let center = (pose.inverse() * Point::new(0.0, 0.0, 80.0)).coords;
         let mut depth = Image::filled(160, 120, 0.0);
         for v in 0..120 {
@@ -344,13 +388,25 @@ mod tests {
                 }
             }
         }
-        DepthMap { depth, weight: Image::filled(160, 120, 1.0), intrinsics, world_from_camera: pose }
+        DepthMap {
+            depth,
+            weight: Image::filled(160, 120, 1.0),
+            intrinsics,
+            world_from_camera: pose,
+        }
     }
 
     #[test]
     fn a_sphere_comes_back_facing_the_cameras() {
         let maps: Vec<DepthMap> = [-15.0, -5.0, 5.0, 15.0].map(map).to_vec();
-        let mesh = fuse(&maps, &SurfaceSettings { triangles: 8000, ..Default::default() }).unwrap();
+        let mesh = fuse(
+            &maps,
+            &SurfaceSettings {
+                triangles: 8000,
+                ..Default::default()
+            },
+        )
+        .unwrap();
         assert!((2000..40_000).contains(&mesh.triangles.len()), "{}", mesh.triangles.len());
         let center = Vector3::new(0.0, 0.0, 80.0);
         let (mut squares, mut count) = (0.0, 0.0);
@@ -369,7 +425,11 @@ mod tests {
                 (b - a).cross(&(c - a)).dot(&(a - center)) > 0.0
             })
             .count();
-        assert!(facing as f64 > 0.99 * mesh.triangles.len() as f64, "{facing} of {}", mesh.triangles.len());
+        assert!(
+            facing as f64 > 0.99 * mesh.triangles.len() as f64,
+            "{facing} of {}",
+            mesh.triangles.len()
+        );
     }
 
     #[test]

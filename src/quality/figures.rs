@@ -49,7 +49,9 @@ pub struct OutputFrame<'a> {
 
 /// Why frames could not be compared.
 #[derive(Debug, thiserror::Error)]
-#[error("expected pictures of {expected_width}×{expected_height} as the truth's, found {width}×{height} ({what}); compare undistorted output of the same size")]
+#[error(
+    "expected pictures of {expected_width}×{expected_height} as the truth's, found {width}×{height} ({what}); compare undistorted output of the same size"
+)]
 pub struct SizeMismatch {
     /// Which picture.
     pub what: &'static str,
@@ -148,11 +150,21 @@ impl Figures {
             ("input", output.input.size()),
         ];
         if let Some(&(what, (width, height))) = sizes.iter().find(|s| s.1 != size) {
-            return Err(SizeMismatch { what, expected_width: size.0, expected_height: size.1, width, height });
+            return Err(SizeMismatch {
+                what,
+                expected_width: size.0,
+                expected_height: size.1,
+                width,
+                height,
+            });
         }
         let count = size.0 * size.1;
-        let instrument: Vec<bool> = truth.instruments.map_or_else(|| vec![false; count], |m| m.pixels().iter().map(|&v| v != 0).collect());
-        let specular: Vec<bool> = (0..count).map(|i| truth.specular.pixels()[i] != 0 && !instrument[i]).collect();
+        let instrument: Vec<bool> = truth
+            .instruments
+            .map_or_else(|| vec![false; count], |m| m.pixels().iter().map(|&v| v != 0).collect());
+        let specular: Vec<bool> = (0..count)
+            .map(|i| truth.specular.pixels()[i] != 0 && !instrument[i])
+            .collect();
         let from_mask = distance(&specular, size.0, size.1);
         let from_instrument = distance(&instrument, size.0, size.1);
         let zones: Vec<Zone> = (0..count)
@@ -167,8 +179,10 @@ impl Figures {
             })
             .collect();
         let texture = texture_of(truth.diffuse, TEXTURE_SIGMA_PX);
-        self.as_it_is.add(output.input, truth.diffuse, &texture, &zones, &self.previous_zone);
-        self.output.add(output.image, truth.diffuse, &texture, &zones, &self.previous_zone);
+        self.as_it_is
+            .add(output.input, truth.diffuse, &texture, &zones, &self.previous_zone);
+        self.output
+            .add(output.image, truth.diffuse, &texture, &zones, &self.previous_zone);
         for i in 0..count {
             let filled = output.mask.pixels()[i] >= FILLED;
             self.filled.0 += u64::from(filled);
@@ -180,7 +194,10 @@ impl Figures {
             self.false_touches += u64::from(filled && from_mask[i] > FALSE_TOUCH_PX && !instrument[i]);
             self.painted += u64::from(filled && instrument[i]);
             if from_mask[i] > ELSEWHERE_PX && from_instrument[i] > ELSEWHERE_PX {
-                self.elsewhere.add(output.image.pixels()[i].map(f32::from), output.input.pixels()[i].map(f32::from));
+                self.elsewhere.add(
+                    output.image.pixels()[i].map(f32::from),
+                    output.input.pixels()[i].map(f32::from),
+                );
             }
         }
         self.pixels += count as u64;
@@ -206,14 +223,22 @@ impl Figures {
 }
 
 impl Scores {
-    fn add(&mut self, image: &Image<Rgb8>, truth: &Image<Rgb8>, truth_texture: &Image<[f32; 3]>, zones: &[Zone], previous: &[Zone]) {
+    fn add(
+        &mut self,
+        image: &Image<Rgb8>,
+        truth: &Image<Rgb8>,
+        truth_texture: &Image<[f32; 3]>,
+        zones: &[Zone],
+        previous: &[Zone],
+    ) {
         let texture = texture_of(image, TEXTURE_SIGMA_PX);
         let ssim = ssim_map(image, truth);
         let gray: Vec<u8> = image.pixels().iter().map(|&p| gray_of(p)).collect();
         for (i, &zone) in zones.iter().enumerate() {
             if zone == Zone::Mask {
                 self.texture.add(texture.pixels()[i], truth_texture.pixels()[i]);
-                self.plain.add(image.pixels()[i].map(f32::from), truth.pixels()[i].map(f32::from));
+                self.plain
+                    .add(image.pixels()[i].map(f32::from), truth.pixels()[i].map(f32::from));
                 self.ssim += ssim.pixels()[i];
             }
             if previous.get(i) == Some(&zone) && self.previous_gray.len() == gray.len() {
@@ -362,7 +387,16 @@ mod tests {
                 strength: &case.strength,
                 instruments: Some(&case.instruments),
             };
-            figures.add(&truth, &OutputFrame { image: &case.output, mask: &case.mask, input: &case.input }).unwrap();
+            figures
+                .add(
+                    &truth,
+                    &OutputFrame {
+                        image: &case.output,
+                        mask: &case.mask,
+                        input: &case.input,
+                    },
+                )
+                .unwrap();
         }
         figures.summary()
     }
@@ -422,8 +456,22 @@ mod tests {
         }
         let mut figures = Figures::new();
         for c in [&first, &second] {
-            let truth = TruthFrame { diffuse: &c.diffuse, specular: &c.specular, strength: &c.strength, instruments: None };
-            figures.add(&truth, &OutputFrame { image: &c.output, mask: &c.mask, input: &c.input }).unwrap();
+            let truth = TruthFrame {
+                diffuse: &c.diffuse,
+                specular: &c.specular,
+                strength: &c.strength,
+                instruments: None,
+            };
+            figures
+                .add(
+                    &truth,
+                    &OutputFrame {
+                        image: &c.output,
+                        mask: &c.mask,
+                        input: &c.input,
+                    },
+                )
+                .unwrap();
         }
         assert!((figures.summary().output.jitter - 2.0).abs() < 1e-12);
     }
@@ -432,8 +480,22 @@ mod tests {
     fn another_size_is_an_error() {
         let case = case();
         let small = Image::filled(8, 8, [0; 3]);
-        let truth = TruthFrame { diffuse: &case.diffuse, specular: &case.specular, strength: &case.strength, instruments: None };
-        let error = Figures::new().add(&truth, &OutputFrame { image: &small, mask: &case.mask, input: &case.input }).unwrap_err();
+        let truth = TruthFrame {
+            diffuse: &case.diffuse,
+            specular: &case.specular,
+            strength: &case.strength,
+            instruments: None,
+        };
+        let error = Figures::new()
+            .add(
+                &truth,
+                &OutputFrame {
+                    image: &small,
+                    mask: &case.mask,
+                    input: &case.input,
+                },
+            )
+            .unwrap_err();
         assert!(error.to_string().contains("80×60") && error.to_string().contains("8×8"));
     }
 }

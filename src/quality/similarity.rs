@@ -140,15 +140,18 @@ fn reflected(index: isize, length: usize, border: Border) -> usize {
 fn blurred(plane: &[f32], width: usize, height: usize, kernel: &[f32], border: Border) -> Vec<f32> {
     let radius = kernel.len() / 2;
     let mut across = vec![0.0_f32; plane.len()];
-    across.par_chunks_mut(width.max(1)).zip(plane.par_chunks(width.max(1))).for_each_init(Vec::new, |padded: &mut Vec<f32>, (out, row)| {
-        padded.clear();
-        padded.extend((-(radius as isize)..(width + radius) as isize).map(|x| row[reflected(x, width, border)]));
-        for (k, &weight) in kernel.iter().enumerate() {
-            for (out, value) in out.iter_mut().zip(&padded[k..]) {
-                *out += weight * value;
+    across
+        .par_chunks_mut(width.max(1))
+        .zip(plane.par_chunks(width.max(1)))
+        .for_each_init(Vec::new, |padded: &mut Vec<f32>, (out, row)| {
+            padded.clear();
+            padded.extend((-(radius as isize)..(width + radius) as isize).map(|x| row[reflected(x, width, border)]));
+            for (k, &weight) in kernel.iter().enumerate() {
+                for (out, value) in out.iter_mut().zip(&padded[k..]) {
+                    *out += weight * value;
+                }
             }
-        }
-    });
+        });
     let mut out = vec![0.0_f32; plane.len()];
     out.par_chunks_mut(width.max(1)).enumerate().for_each(|(y, out)| {
         for (k, &weight) in kernel.iter().enumerate() {
@@ -183,7 +186,11 @@ mod tests {
         let c1 = 6.5025;
         let expected = (2.0 * 100.0 * 120.0 + c1) / (100.0 * 100.0 + 120.0 * 120.0 + c1);
         let found = ssim_map(&flat(100), &flat(120));
-        assert!(found.pixels().iter().all(|s| (s - expected).abs() < 1e-4), "{}", found.at(3, 3));
+        assert!(
+            found.pixels().iter().all(|s| (s - expected).abs() < 1e-4),
+            "{}",
+            found.at(3, 3)
+        );
     }
 
     #[test]

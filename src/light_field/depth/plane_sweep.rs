@@ -36,7 +36,12 @@ pub struct Plane {
 
 impl Plane {
     /// The view at full size.
-    pub fn new(image: &Image<Rgb8>, confidence: &Mask, intrinsics: Intrinsics, world_from_camera: Transform<World, Camera>) -> Self {
+    pub fn new(
+        image: &Image<Rgb8>,
+        confidence: &Mask,
+        intrinsics: Intrinsics,
+        world_from_camera: Transform<World, Camera>,
+    ) -> Self {
         let (width, height) = image.size();
         let mut gray = Image::filled(width, height, 0.0_f32);
         let mut weight = Image::filled(width, height, 0.0_f32);
@@ -53,7 +58,12 @@ impl Plane {
         }
         let mean = if count > 0.0 { (sum / count) as f32 } else { 0.0 };
         gray.pixels_mut().iter_mut().for_each(|v| *v -= mean);
-        Self { gray, weight, intrinsics, world_from_camera }
+        Self {
+            gray,
+            weight,
+            intrinsics,
+            world_from_camera,
+        }
     }
 
     /// Half the size; confident pixels count, others do not.
@@ -74,7 +84,12 @@ impl Plane {
                 weight.set(x, y, if total >= 2.0 { 1.0 } else { 0.0 });
             }
         }
-        Self { gray, weight, intrinsics: self.intrinsics.scaled(0.5), world_from_camera: self.world_from_camera }
+        Self {
+            gray,
+            weight,
+            intrinsics: self.intrinsics.scaled(0.5),
+            world_from_camera: self.world_from_camera,
+        }
     }
 }
 
@@ -106,7 +121,14 @@ pub struct Scratch {
 
 /// Matching cost (0 good … 1 bad) per pixel and hypothesis, pixel-major, averaged over the neighbours that see the place.
 /// `base` is inverse depth per pixel of `reference`.
-pub fn costs(reference: &Plane, neighbours: &[&Plane], base: &Image<f32>, sweep: Sweep, scratch: &mut Scratch, out: &mut Vec<f32>) {
+pub fn costs(
+    reference: &Plane,
+    neighbours: &[&Plane],
+    base: &Image<f32>,
+    sweep: Sweep,
+    scratch: &mut Scratch,
+    out: &mut Vec<f32>,
+) {
     let (width, height) = reference.gray.size();
     let pixels = width * height;
     out.clear();
@@ -119,10 +141,19 @@ pub fn costs(reference: &Plane, neighbours: &[&Plane], base: &Image<f32>, sweep:
     for neighbour in neighbours {
         let motion = neighbour.world_from_camera.inverse() * reference.world_from_camera;
         let k = matrix(&neighbour.intrinsics);
-        let map: Matrix3<f32> = k * motion.rotation().to_rotation_matrix().matrix().cast::<f32>() * inverse_matrix(&reference.intrinsics);
+        let map: Matrix3<f32> =
+            k * motion.rotation().to_rotation_matrix().matrix().cast::<f32>() * inverse_matrix(&reference.intrinsics);
         let shift: Vector3<f32> = k * motion.translation().cast::<f32>();
         for index in 0..sweep.count {
-            warp(reference, neighbour, &map, &shift, base, sweep.offset(index as f32), &mut scratch.sums);
+            warp(
+                reference,
+                neighbour,
+                &map,
+                &shift,
+                base,
+                sweep.offset(index as f32),
+                &mut scratch.sums,
+            );
             for sum in &mut scratch.sums {
                 box_sum(sum, width, height, sweep.radius, &mut scratch.columns);
             }
@@ -148,7 +179,15 @@ pub fn costs(reference: &Plane, neighbours: &[&Plane], base: &Image<f32>, sweep:
 }
 
 /// Per pixel: weight, and weighted a, b, a², b², ab; a the reference's gray, b the neighbour's where the hypothesis puts it.
-fn warp(reference: &Plane, neighbour: &Plane, map: &Matrix3<f32>, shift: &Vector3<f32>, base: &Image<f32>, offset: f32, sums: &mut [Vec<f32>; 6]) {
+fn warp(
+    reference: &Plane,
+    neighbour: &Plane,
+    map: &Matrix3<f32>,
+    shift: &Vector3<f32>,
+    base: &Image<f32>,
+    offset: f32,
+    sums: &mut [Vec<f32>; 6],
+) {
     let (width, height) = reference.gray.size();
     let (right, bottom) = (neighbour.gray.width() as f32 - 1.001, neighbour.gray.height() as f32 - 1.001);
     let stride = neighbour.gray.width();

@@ -22,7 +22,15 @@ pub struct Paths {
 }
 
 /// Sums of path costs, as many as `costs`, into `out`.
-pub fn aggregate(costs: &[f32], width: usize, height: usize, count: usize, smoothness: Smoothness, paths: &mut Paths, out: &mut Vec<f32>) {
+pub fn aggregate(
+    costs: &[f32],
+    width: usize,
+    height: usize,
+    count: usize,
+    smoothness: Smoothness,
+    paths: &mut Paths,
+    out: &mut Vec<f32>,
+) {
     out.clear();
     out.resize(costs.len(), 0.0);
     paths.previous.resize(width.max(1) * count, 0.0);
@@ -37,7 +45,14 @@ pub fn aggregate(costs: &[f32], width: usize, height: usize, count: usize, smoot
             for step in 0..width {
                 let x = if reversed { width - 1 - step } else { step };
                 let at = (y * width + x) * count;
-                least = advance(&costs[at..at + count], previous, least, smoothness, current, &mut out[at..at + count]);
+                least = advance(
+                    &costs[at..at + count],
+                    previous,
+                    least,
+                    smoothness,
+                    current,
+                    &mut out[at..at + count],
+                );
                 previous.copy_from_slice(current);
             }
         }
@@ -133,9 +148,21 @@ mod tests {
             costs[(3 * width + 4) * count + d] = 0.5;
         }
         let mut sums = Vec::new();
-        aggregate(&costs, width, height, count, Smoothness { step: 0.1, jump: 0.6 }, &mut Paths::default(), &mut sums);
+        aggregate(
+            &costs,
+            width,
+            height,
+            count,
+            Smoothness { step: 0.1, jump: 0.6 },
+            &mut Paths::default(),
+            &mut sums,
+        );
         let found = winners(&sums, width, height, count);
-        assert!(found.index.pixels().iter().all(|&d| (d - 3.0).abs() < 1e-3), "{:?}", found.index);
+        assert!(
+            found.index.pixels().iter().all(|&d| (d - 3.0).abs() < 1e-3),
+            "{:?}",
+            found.index
+        );
     }
 
     #[test]
