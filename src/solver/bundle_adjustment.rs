@@ -439,8 +439,8 @@ mod tests {
             .collect();
         let points: Vec<_> = (0..points)
             .map(|_| {
-                let (x, y) = (rng.random_range(-25.0..25.0), rng.random_range(-15.0..15.0));
-                Vector3::new(x, y, 75.0 + 6.0 * (0.2 * x as f64).sin() + rng.random_range(-3.0..3.0))
+                let (x, y): (f64, f64) = (rng.random_range(-25.0..25.0), rng.random_range(-15.0..15.0));
+                Vector3::new(x, y, 75.0 + 6.0 * (0.2 * x).sin() + rng.random_range(-3.0..3.0))
             })
             .collect();
         let observations = points
