@@ -2,7 +2,12 @@
 //!
 //! Prints ms per stage, frames per second and memory. `cargo bench --bench pipeline [-- FRAMES]`, 150 frames unless told.
 //! Decoding and encoding are not in it; `endofield process --report` measures them too.
-#![expect(clippy::print_stdout, clippy::print_stderr, clippy::expect_used, reason = "it is its own harness")]
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    clippy::expect_used,
+    reason = "it is its own harness"
+)]
 
 use std::sync::Arc;
 
