@@ -2,7 +2,12 @@
 //!
 //! Prints ms per stage, frames per second and memory. `cargo bench --bench pipeline [-- FRAMES]`, 150 frames unless told.
 //! Decoding and encoding are not in it; `endofield process --report` measures them too.
-#![expect(clippy::print_stdout, clippy::print_stderr, clippy::expect_used, reason = "it is its own harness")]
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    clippy::expect_used,
+    reason = "it is its own harness"
+)]
 
 use std::sync::Arc;
 
@@ -27,7 +32,7 @@ use endofield::recording::folder::{Recording, Video};
 use endofield::robot::hand_eye::HandEye;
 use endofield::robot::trajectory::{TimedPose, Trajectory as ArmTrajectory};
 use endofield::synthetic::organs::Anatomy;
-use endofield::synthetic::renderer::{Renderer, Shot, Truth};
+use endofield::synthetic::renderer::{Obstacles, Renderer, Shot, Truth};
 use endofield::synthetic::scene::{World3d, laparoscope};
 use endofield::synthetic::trajectory::{Course, Trajectory};
 use endofield::time::{Clock as _, MonotonicClock, Span, Timestamp};
@@ -92,6 +97,7 @@ fn rendered(renderer: &Renderer, course: Course, count: usize, with_truth: bool)
                 world_from_camera: path.world_from_camera(seconds),
                 exposure: 1.0,
                 noise_key: 1,
+                obstacles: Obstacles::default(),
             };
             let picture = renderer.render(&shot, with_truth);
             (shot, picture.video, picture.truth)

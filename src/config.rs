@@ -211,7 +211,11 @@ impl Config {
         // Amounts, reaches and shares: none of them can be negative, and no setting at all can be infinite or no number.
         let tree = Table::try_from(self).map_err(|error| error.to_string())?;
         for (group, settings) in &tree {
-            let lowest = if NEVER_NEGATIVE.contains(&group.as_str()) { 0.0 } else { f64::MIN };
+            let lowest = if NEVER_NEGATIVE.contains(&group.as_str()) {
+                0.0
+            } else {
+                f64::MIN
+            };
             check_numbers(group, settings, lowest)?;
         }
         Ok(())
@@ -223,7 +227,9 @@ const NEVER_NEGATIVE: [&str; 3] = ["specularity", "pose_refinement", "substituti
 
 fn check_numbers(key: &str, value: &Value, lowest: f64) -> Result<(), String> {
     match value {
-        Value::Table(table) => table.iter().try_for_each(|(name, inner)| check_numbers(&format!("{key}.{name}"), inner, lowest)),
+        Value::Table(table) => table
+            .iter()
+            .try_for_each(|(name, inner)| check_numbers(&format!("{key}.{name}"), inner, lowest)),
         Value::Array(list) => list.iter().try_for_each(|inner| check_numbers(key, inner, lowest)),
         Value::Float(number) if !number.is_finite() => Err(format!("{key}: expected a finite number, found {number}")),
         Value::Float(number) if *number < lowest => Err(format!("{key}: expected {lowest} or more, found {number}")),

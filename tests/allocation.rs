@@ -68,14 +68,25 @@ fn main() -> std::process::ExitCode {
         println!("{fault}");
     }
     println!("no_allocation_per_frame ... {}", if failed == 0 { "ok" } else { "FAILED" });
-    println!("\ntest result: {}. {} passed; {failed} failed", if failed == 0 { "ok" } else { "FAILED" }, 1 - failed);
+    println!(
+        "\ntest result: {}. {} passed; {failed} failed",
+        if failed == 0 { "ok" } else { "FAILED" },
+        1 - failed
+    );
     std::process::ExitCode::from(failed as u8)
 }
 
 /// One line for each stage that allocated.
 fn allocations() -> Vec<String> {
-    let recording = Recording { camera: Some(scene::laparoscope(SIZE.0, SIZE.1)), ..Recording::plain(Video::File("none".into())) };
-    let equipment = Equipment { recording: &recording, light_field: None, size: SIZE };
+    let recording = Recording {
+        camera: Some(scene::laparoscope(SIZE.0, SIZE.1)),
+        ..Recording::plain(Video::File("none".into()))
+    };
+    let equipment = Equipment {
+        recording: &recording,
+        light_field: None,
+        size: SIZE,
+    };
     let mut config = Config::default();
     // There is no color.yaml; the stage shall work.
     config.color.reference = ReferenceSource::Start;

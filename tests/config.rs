@@ -78,7 +78,10 @@ fn what_is_wrong_is_named() {
     let message = set("outputs.crf=9").unwrap_err();
     assert!(message.contains("outputs") && message.contains("output"), "{message}");
     let message = set("substitution.reach_px=-1").unwrap_err();
-    assert!(message.contains("substitution.reach_px") && message.contains("-1"), "{message}");
+    assert!(
+        message.contains("substitution.reach_px") && message.contains("-1"),
+        "{message}"
+    );
     assert!(set("substitution.reach_px=nan").unwrap_err().contains("finite"));
     assert!(set("output=9").unwrap_err().contains("group"));
     assert!("output.crf".parse::<Assignment>().is_err());

@@ -15,8 +15,15 @@ use crate::support::scene::laparoscope;
 
 fn run_once() -> Seen {
     let (width, height) = (192, 128);
-    let recording = Recording { camera: Some(laparoscope(width, height)), ..Recording::plain(Video::File("none".into())) };
-    let equipment = Equipment { recording: &recording, light_field: None, size: (width, height) };
+    let recording = Recording {
+        camera: Some(laparoscope(width, height)),
+        ..Recording::plain(Video::File("none".into()))
+    };
+    let equipment = Equipment {
+        recording: &recording,
+        light_field: None,
+        size: (width, height),
+    };
     let mut config = Config::default();
     // There is no color.yaml; the stage shall work.
     config.color.reference = ReferenceSource::Start;
@@ -27,7 +34,13 @@ fn run_once() -> Seen {
     for stage in line.stages {
         builder = builder.stage(stage);
     }
-    let outcome = builder.sink(Box::new(sink), Queue::blocking(2)).build().unwrap().start().unwrap().wait();
+    let outcome = builder
+        .sink(Box::new(sink), Queue::blocking(2))
+        .build()
+        .unwrap()
+        .start()
+        .unwrap()
+        .wait();
     assert!(outcome.faults().is_empty(), "{:?}", outcome.faults());
     assert!(outcome.stages.iter().all(|stage| stage.failures == 0), "{:?}", outcome.stages);
     seen

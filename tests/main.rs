@@ -5,16 +5,9 @@
     clippy::panic,
     reason = "a helper of a test may fail the test; clippy excuses only the test functions themselves"
 )]
-#![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
 
 mod architecture;
 mod camera;
-mod recording;
-mod robot;
-mod undistortion;
-mod media;
-#![expect(clippy::unwrap_used, clippy::expect_used, reason = "a test tells what went wrong by where it stops")]
-
 mod cli;
 mod color;
 mod config;

@@ -76,7 +76,10 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     tracing::info!("1 of 4: simulating an operation (survey and live recording, with the truth)");
     let began = MonotonicClock.now();
     let simulation = folder.join("simulation");
-    let settings = Settings { seed: args.seed, ..Settings::default() };
+    let settings = Settings {
+        seed: args.seed,
+        ..Settings::default()
+    };
     simulate(&simulation, &settings, &context.console).context("simulating")?;
     parts.simulate_s = since(began);
     if context.console.stopping() {
@@ -86,7 +89,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     tracing::info!("2 of 4: building the light field from the survey");
     let began = MonotonicClock.now();
     let light_field_folder = folder.join("light_field");
-    let (light_field, _) = light_field::built(&simulation.join("survey"), VIEWS, true, &context.console).context("building the light field")?;
+    let (light_field, _) =
+        light_field::built(&simulation.join("survey"), VIEWS, true, &context.console).context("building the light field")?;
     light_field_file::save(&light_field, &light_field_folder, &context.console)?;
     drop(light_field);
     parts.light_field_s = since(began);
@@ -117,8 +121,15 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     tracing::info!("4 of 4: specularities alone, measured against the truth");
     let began = MonotonicClock.now();
     let measured = Arc::new(Mutex::new(Measured::default()));
-    let camera = Recording::open(&live)?.camera.context("expected the simulated recording to have a camera.yaml, found none")?;
-    let sink = MeasureSink::new(&simulation.join("truth/live"), &camera, &context.config.undistort, Arc::clone(&measured))?;
+    let camera = Recording::open(&live)?
+        .camera
+        .context("expected the simulated recording to have a camera.yaml, found none")?;
+    let sink = MeasureSink::new(
+        &simulation.join("truth/live"),
+        &camera,
+        &context.config.undistort,
+        Arc::clone(&measured),
+    )?;
     let alone = process::Args {
         output: folder.join("specular_only.mp4"),
         stages: vec![Choice::Undistort, Choice::Specular],
@@ -140,7 +151,12 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         image::save_buffer(&path, picture.as_bytes(), width, height, image::ColorType::Rgb8)
             .with_context(|| format!("writing {}", path.display()))?;
     }
-    let report = DemoReport { quality, parts, whole_line: &enhanced.report, measured_line: &specular.report };
+    let report = DemoReport {
+        quality,
+        parts,
+        whole_line: &enhanced.report,
+        measured_line: &specular.report,
+    };
     write(&folder.join("report.json"), &(serde_json::to_string_pretty(&report)? + "\n"))?;
     let text = markdown(&report, &settings);
     write(&folder.join("report.md"), &text)?;
@@ -164,12 +180,19 @@ fn write(path: &Path, text: &str) -> anyhow::Result<()> {
 /// An empty place; with --force what an earlier demo made there is removed, and nothing else.
 fn make_room(folder: &Path, context: &Context) -> anyhow::Result<()> {
     if folder.is_file() {
-        bail!("{}: expected a folder or nothing there, found a file; name another folder with -o", folder.display());
+        bail!(
+            "{}: expected a folder or nothing there, found a file; name another folder with -o",
+            folder.display()
+        );
     }
     context.refuse_overwriting(folder)?;
     for name in MADE {
         let path = folder.join(name);
-        let removed = if path.is_dir() { std::fs::remove_dir_all(&path) } else { std::fs::remove_file(&path) };
+        let removed = if path.is_dir() {
+            std::fs::remove_dir_all(&path)
+        } else {
+            std::fs::remove_file(&path)
+        };
         match removed {
             Err(error) if error.kind() != std::io::ErrorKind::NotFound => {
                 return Err(error).with_context(|| format!("removing {}", path.display()));
@@ -189,15 +212,39 @@ fn rows(quality: &Summary) -> Vec<[String; 3]> {
     let percent = |share: f64| format!("{:.2} %", 100.0 * share);
     let none = || "–".to_owned();
     vec![
-        row("texture PSNR in the specular mask", format!("{:.1} dB", before.texture_psnr), format!("{:.1} dB", after.texture_psnr)),
-        row("SSIM in the specular mask", format!("{:.3}", before.ssim), format!("{:.3}", after.ssim)),
-        row("plain PSNR in the specular mask", format!("{:.1} dB", before.plain_psnr), format!("{:.1} dB", after.plain_psnr)),
-        row("jitter (mask over ring)", format!("{:.2}", before.jitter), format!("{:.2}", after.jitter)),
+        row(
+            "texture PSNR in the specular mask",
+            format!("{:.1} dB", before.texture_psnr),
+            format!("{:.1} dB", after.texture_psnr),
+        ),
+        row(
+            "SSIM in the specular mask",
+            format!("{:.3}", before.ssim),
+            format!("{:.3}", after.ssim),
+        ),
+        row(
+            "plain PSNR in the specular mask",
+            format!("{:.1} dB", before.plain_psnr),
+            format!("{:.1} dB", after.plain_psnr),
+        ),
+        row(
+            "jitter (mask over ring)",
+            format!("{:.2}", before.jitter),
+            format!("{:.2}", after.jitter),
+        ),
         row("recall of strong specular pixels", none(), percent(quality.recall)),
         row("false touches", none(), percent(quality.false_touches)),
-        row("PSNR elsewhere, against the input", none(), format!("{:.1} dB", quality.elsewhere_psnr)),
+        row(
+            "PSNR elsewhere, against the input",
+            none(),
+            format!("{:.1} dB", quality.elsewhere_psnr),
+        ),
         row("instrument pixels painted", none(), quality.instrument_painted.to_string()),
-        row("filled pixels from the light field", none(), percent(quality.from_light_field)),
+        row(
+            "filled pixels from the light field",
+            none(),
+            percent(quality.from_light_field),
+        ),
     ]
 }
 
@@ -229,9 +276,16 @@ fn markdown(report: &DemoReport<'_>, settings: &Settings) -> String {
     let _infallible = writeln!(text, "\n## Time\n\nThe whole line, {:.1} fps.\n", line.frames_per_second);
     text += "| stage | p50 ms | p95 ms | p99 ms | max ms |\n|---|---|---|---|---|\n";
     let stages = line.stages.iter().map(|stage| (stage.name.as_str(), &stage.working));
-    for (name, times) in [("source", &line.source)].into_iter().chain(stages).chain([("end to end", &line.end_to_end)]) {
-        let _infallible =
-            writeln!(text, "| {name} | {:.1} | {:.1} | {:.1} | {:.1} |", times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms);
+    for (name, times) in [("source", &line.source)]
+        .into_iter()
+        .chain(stages)
+        .chain([("end to end", &line.end_to_end)])
+    {
+        let _infallible = writeln!(
+            text,
+            "| {name} | {:.1} | {:.1} | {:.1} | {:.1} |",
+            times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms
+        );
     }
     let parts = &report.parts;
     let _infallible = writeln!(

@@ -70,16 +70,39 @@ impl MeasureSink {
         let name = format!("{:06}.png", frame.id.0);
         let picture = |kind: &str| read_rgb(&self.truth.join(kind).join(&name));
         let mask = |kind: &str| read_mask(&self.truth.join(kind).join(&name));
-        let (diffuse, specular, strength, instruments) = (picture("diffuse")?, mask("specular")?, mask("strength")?, mask("instrument")?);
-        let original = frame.original.as_ref().context("expected the line to keep each picture as it came, found none")?;
+        let (diffuse, specular, strength, instruments) =
+            (picture("diffuse")?, mask("specular")?, mask("strength")?, mask("instrument")?);
+        let original = frame
+            .original
+            .as_ref()
+            .context("expected the line to keep each picture as it came, found none")?;
         let mut input = Frame::new(frame.id, frame.exposed_at, frame.arrived_at, self.pool.take_copy(original));
         self.undistortion.process(&mut input)?;
-        let truth = TruthFrame { diffuse: &diffuse, specular: &specular, strength: &strength, instruments: Some(&instruments) };
-        let code = frame.provenance.as_ref().map_or(&self.untouched, |provenance| &*provenance.code);
+        let truth = TruthFrame {
+            diffuse: &diffuse,
+            specular: &specular,
+            strength: &strength,
+            instruments: Some(&instruments),
+        };
+        let code = frame
+            .provenance
+            .as_ref()
+            .map_or(&self.untouched, |provenance| &*provenance.code);
         let mut measured = self.measured.lock().unwrap_or_else(PoisonError::into_inner);
-        measured.figures.add(&truth, &OutputFrame { image: &frame.image, mask: code, input: &input.image })?;
+        measured.figures.add(
+            &truth,
+            &OutputFrame {
+                image: &frame.image,
+                mask: code,
+                input: &input.image,
+            },
+        )?;
         let specular_pixels = specular.pixels().iter().filter(|value| **value > 0).count();
-        if measured.telling.as_ref().is_none_or(|best| best.specular_pixels < specular_pixels) {
+        if measured
+            .telling
+            .as_ref()
+            .is_none_or(|best| best.specular_pixels < specular_pixels)
+        {
             measured.telling = Some(Telling {
                 specular_pixels,
                 specular,
@@ -145,9 +168,14 @@ pub fn before_after(measured: &Measured) -> Option<Image<Rgb8>> {
 fn densest_window(mask: &Mask, width: usize, height: usize) -> (usize, usize) {
     const STEP: usize = 8;
     let count = |left: usize, top: usize| -> usize {
-        (top..top + height).step_by(2).map(|y| mask.row(y)[left..left + width].iter().filter(|value| **value > 0).count()).sum()
+        (top..top + height)
+            .step_by(2)
+            .map(|y| mask.row(y)[left..left + width].iter().filter(|value| **value > 0).count())
+            .sum()
     };
-    let places = (0..=mask.height() - height).step_by(STEP).flat_map(|top| (0..=mask.width() - width).step_by(STEP).map(move |left| (left, top)));
+    let places = (0..=mask.height() - height)
+        .step_by(STEP)
+        .flat_map(|top| (0..=mask.width() - width).step_by(STEP).map(move |left| (left, top)));
     places.max_by_key(|(left, top)| count(*left, *top)).unwrap_or((0, 0))
 }
 
@@ -162,7 +190,10 @@ mod tests {
             mask.row_mut(y)[400..460].fill(255);
         }
         let (left, top) = densest_window(&mask, 240, 180);
-        assert!(left <= 400 && left + 240 >= 460 && top <= 200 && top + 180 >= 240, "{left} {top}");
+        assert!(
+            left <= 400 && left + 240 >= 460 && top <= 200 && top + 180 >= 240,
+            "{left} {top}"
+        );
     }
 
     #[test]
@@ -174,9 +205,16 @@ mod tests {
             after: Image::filled(300, 200, [2; 3]),
             truth: Image::filled(300, 200, [3; 3]),
         };
-        let picture = before_after(&Measured { telling: Some(telling), ..Measured::default() }).unwrap();
+        let picture = before_after(&Measured {
+            telling: Some(telling),
+            ..Measured::default()
+        })
+        .unwrap();
         assert_eq!(picture.size(), (3 * 720 + 12, 540));
         let third = picture.width() / 3;
-        assert_eq!([picture.at(5, 5), picture.at(third + 60, 5), picture.at(2 * third + 60, 5)], [[1; 3], [2; 3], [3; 3]]);
+        assert_eq!(
+            [picture.at(5, 5), picture.at(third + 60, 5), picture.at(2 * third + 60, 5)],
+            [[1; 3], [2; 3], [3; 3]]
+        );
     }
 }

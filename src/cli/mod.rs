@@ -88,8 +88,16 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
     let console = Console::new(cli.globals.progress, Arc::clone(&stop));
     console.install_log(&cli.globals)?;
     let context = Context { config: cli.globals.config()?, force: cli.globals.force, console, stop };
-    let ended = run(cli.command, &context)?;
-    Ok(if context.stop.load(Ordering::Acquire) && ended == Ended::Complete { Ended::Interrupted } else { ended })
+    let result = run(cli.command, &context);
+    match result {
+        Ok(Ended::Complete) if context.stop.load(Ordering::Acquire) => Ok(Ended::Interrupted),
+        // What a command calls an error because it was stopped is what the user wanted.
+        Err(error) if context.stop.load(Ordering::Acquire) => {
+            tracing::info!("{error:#}");
+            Ok(Ended::Interrupted)
+        }
+        result => result,
+    }
 }
 
 fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {

@@ -236,7 +236,7 @@ impl Sums {
         let rx = self.covariance(self.xi, self.x, self.i) - gain * xt;
         let ry = self.covariance(self.yi, self.y, self.i) - gain * yt;
         let determinant = xx * yy - xy * xy;
-        if !(determinant > 1e-6 * (xx + yy) * (xx + yy)) {
+        if determinant.is_nan() || determinant <= 1e-6 * (xx + yy) * (xx + yy) {
             return None;
         }
         let scale = -1.0 / (determinant * gain);

@@ -171,7 +171,6 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
     })
 }
 
-#[expect(clippy::too_many_arguments, reason = "the parts of one folder, all named")]
 fn read_view(
     folder: &Path,
     pictures: &Path,

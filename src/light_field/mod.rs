@@ -14,6 +14,7 @@ pub mod ply;
 pub mod prior;
 pub mod rasterize;
 pub mod renderer;
+pub mod refinement;
 pub mod reobservation;
 pub mod selection;
 pub mod surface;

@@ -96,7 +96,8 @@ struct Heard {
     view: usize,
     x: f32,
     y: f32,
-    log_brightness: f32,
+    distance: f32,
+    rho2: f32,
 }
 
 /// Renders a light field; keeps its buffers.
@@ -270,18 +271,14 @@ impl Renderer {
                 continue;
             }
             let (penalty, distance) = source.penalty(point, &from_eye, eye_distance);
-            let log_brightness = if self.shading.is_flat() {
-                0.0
-            } else {
-                self.shading.log_brightness(distance, u * u + v * v)
-            };
             let new = Heard {
                 penalty,
                 weight: confidence * (border / FEATHER_PX).min(1.0),
                 view: index,
                 x,
                 y,
-                log_brightness,
+                distance,
+                rho2: u * u + v * v,
             };
             // Insertion into the short list, least penalty first; the last place gives the threshold only.
             let mut place = count.min(BLENDED);
@@ -305,7 +302,8 @@ impl Renderer {
         } else {
             heard[spoken - 1].penalty * 1.5
         };
-        let here = if self.shading.is_flat() {
+        let flat = self.shading.is_flat();
+        let here = if flat {
             0.0
         } else {
             self.shading.log_brightness(eye_distance, rho2)
@@ -316,10 +314,10 @@ impl Renderer {
             let weight = voice.weight * ((1.0 - voice.penalty / threshold).max(0.0) + 1e-4) / voice.penalty;
             let source = &self.sources[voice.view];
             let color = bilinear_rgb(&light_field.views[voice.view].image, voice.x, voice.y);
-            let lamp = if voice.log_brightness == here {
+            let lamp = if flat {
                 1.0
             } else {
-                (here - voice.log_brightness).exp()
+                (here - self.shading.log_brightness(voice.distance, voice.rho2)).exp()
             };
             for channel in 0..3 {
                 sum[channel] += weight * lamp * source.gain[channel] * color[channel];

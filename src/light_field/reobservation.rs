@@ -166,7 +166,7 @@ fn reobserved_one(
             observations.push((view, Vector2::new(f64::from(m.x), f64::from(m.y))));
         }
     }
-    (observations.len() >= 3).then(|| Feature {
+    (observations.len() >= 3).then_some(Feature {
         track: Track { anchor, observations },
         position: feature.position,
     })

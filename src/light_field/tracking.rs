@@ -85,7 +85,7 @@ pub(crate) fn common_depth(views: &Views<'_>, choice: &TrackingChoice) -> Option
     let mut baselines: Vec<f64> = pairs.iter().map(|(a, b)| baseline(views, *a, *b)).collect();
     baselines.sort_by(f64::total_cmp);
     let typical = *baselines.get(baselines.len() / 2)?;
-    if !(typical > 0.0) {
+    if typical.is_nan() || typical <= 0.0 {
         return None;
     }
     let depths: Vec<f64> = (0..DEPTH_STEPS).map(|k| typical * 2.0 * 1.14f64.powi(k as i32)).collect();

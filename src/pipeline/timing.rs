@@ -25,7 +25,9 @@ impl Durations {
     /// None yet. All the memory it will ever need is taken here.
     #[expect(clippy::expect_used, reason = "the bounds are constants and a test makes one")]
     pub fn new() -> Self {
-        Self { histogram: Histogram::new_with_bounds(FINEST_NS, LONGEST_NS, 3).expect("1 <= low, 2 low <= high, digits <= 5") }
+        Self {
+            histogram: Histogram::new_with_bounds(FINEST_NS, LONGEST_NS, 3).expect("1 <= low, 2 low <= high, digits <= 5"),
+        }
     }
 
     /// Count one more. A negative duration (a clock that stepped back) counts as zero.
@@ -40,7 +42,11 @@ impl Durations {
 
     /// The duration that `share` (0–1) of all do not exceed, ms; 0 when there are none.
     pub fn quantile_ms(&self, share: f64) -> f64 {
-        if self.histogram.is_empty() { 0.0 } else { ms_from_ns(self.histogram.value_at_quantile(share)) }
+        if self.histogram.is_empty() {
+            0.0
+        } else {
+            ms_from_ns(self.histogram.value_at_quantile(share))
+        }
     }
 
     /// Count, percentiles and maximum.
@@ -90,7 +96,12 @@ mod tests {
         }
         let summary = durations.summary();
         // Three significant digits: within 0.1 %.
-        for (found, expected) in [(summary.p50_ms, 50.0), (summary.p95_ms, 95.0), (summary.p99_ms, 99.0), (summary.max_ms, 100.0)] {
+        for (found, expected) in [
+            (summary.p50_ms, 50.0),
+            (summary.p95_ms, 95.0),
+            (summary.p99_ms, 99.0),
+            (summary.max_ms, 100.0),
+        ] {
             assert!((found - expected).abs() <= 1e-3 * expected, "{summary:?}");
         }
         assert_eq!(summary.count, 100);

@@ -39,7 +39,12 @@ pub(super) struct FanOut {
 
 impl FanOut {
     pub(super) fn new(doors: Vec<Sender<Handed>>, clock: Arc<dyn Clock>, shared: Arc<Shared>) -> Self {
-        Self { doors, clock, shared, end_to_end: Durations::new() }
+        Self {
+            doors,
+            clock,
+            shared,
+            end_to_end: Durations::new(),
+        }
     }
 
     fn push(&mut self, frame: Frame) -> Result<(), Closed> {
@@ -80,9 +85,21 @@ impl Output {
 /// What a thread of the line leaves behind.
 #[derive(Debug)]
 pub(super) enum Left {
-    Source { working: Durations, failure: Option<String>, stopped: bool, end_to_end: Option<Durations> },
-    Stage { position: usize, outcome: StageOutcome, end_to_end: Option<Durations> },
-    Sink { position: usize, outcome: SinkOutcome },
+    Source {
+        working: Durations,
+        failure: Option<String>,
+        stopped: bool,
+        end_to_end: Option<Durations>,
+    },
+    Stage {
+        position: usize,
+        outcome: StageOutcome,
+        end_to_end: Option<Durations>,
+    },
+    Sink {
+        position: usize,
+        outcome: SinkOutcome,
+    },
 }
 
 /// Asks the source for frames and sends them into the line.
@@ -140,11 +157,21 @@ impl SourceWorker {
         if let Some(message) = &failure {
             tracing::error!("{message}");
         }
-        Left::Source { working, failure, stopped, end_to_end: self.output.end_to_end() }
+        Left::Source {
+            working,
+            failure,
+            stopped,
+            end_to_end: self.output.end_to_end(),
+        }
     }
 
     fn untouched_copy(&self, frame: &Frame) -> Frame {
-        let mut copy = Frame::new(frame.id, frame.exposed_at, frame.arrived_at, self.copies.take_copy(&frame.image));
+        let mut copy = Frame::new(
+            frame.id,
+            frame.exposed_at,
+            frame.arrived_at,
+            self.copies.take_copy(&frame.image),
+        );
         copy.since_previous = frame.since_previous;
         copy.camera.clone_from(&frame.camera);
         copy.field_of_view.clone_from(&frame.field_of_view);
@@ -172,7 +199,10 @@ enum Passage {
 impl StageWorker {
     pub(super) fn run(mut self) -> Left {
         let mut state = StageState {
-            outcome: StageOutcome { name: self.stage.name(), ..StageOutcome::default() },
+            outcome: StageOutcome {
+                name: self.stage.name(),
+                ..StageOutcome::default()
+            },
             failing: false,
             was_off: false,
             strength: None,
@@ -191,12 +221,21 @@ impl StageWorker {
                 }
                 Passage::Bypassed => true,
             };
-            frame.timings.push(StageTiming { stage: state.outcome.name, entered, left, bypassed });
+            frame.timings.push(StageTiming {
+                stage: state.outcome.name,
+                entered,
+                left,
+                bypassed,
+            });
             if self.output.push(frame).is_err() {
                 break;
             }
         }
-        Left::Stage { position: self.position, outcome: state.outcome, end_to_end: self.output.end_to_end() }
+        Left::Stage {
+            position: self.position,
+            outcome: state.outcome,
+            end_to_end: self.output.end_to_end(),
+        }
     }
 
     fn treat(&mut self, frame: &mut Frame, state: &mut StageState) -> Passage {
@@ -211,7 +250,9 @@ impl StageWorker {
         // A stage works on its own buffers and swaps its result in as its last act, so whatever unwinds before that leaves the
         // frame as it came, and a stage that unwound is never called again: nothing half-done is ever looked at.
         let result = catch_unwind(AssertUnwindSafe(|| {
-            let gap = state.last.is_some_and(|last| frame.id.0 <= last || frame.id.0 - last > RESET_AFTER_LOST_FRAMES);
+            let gap = state
+                .last
+                .is_some_and(|last| frame.id.0 <= last || frame.id.0 - last > RESET_AFTER_LOST_FRAMES);
             if gap || state.was_off {
                 self.stage.reset();
             }
@@ -289,7 +330,10 @@ pub(super) struct SinkWorker {
 
 impl SinkWorker {
     pub(super) fn run(mut self) -> Left {
-        let mut outcome = SinkOutcome { name: self.sink.name(), ..SinkOutcome::default() };
+        let mut outcome = SinkOutcome {
+            name: self.sink.name(),
+            ..SinkOutcome::default()
+        };
         while let Some((frame, handed)) = self.input.pop() {
             let entered = self.clock.now();
             outcome.waiting.record(entered - handed);
@@ -311,7 +355,10 @@ impl SinkWorker {
             tracing::error!("{failure}");
         }
         outcome.dropped = self.drops.get();
-        Left::Sink { position: self.position, outcome }
+        Left::Sink {
+            position: self.position,
+            outcome,
+        }
     }
 }
 

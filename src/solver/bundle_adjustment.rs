@@ -160,6 +160,9 @@ fn linearized(
     Some((residual, by_pose, slope * rotation.transpose()))
 }
 
+/// Poses and points.
+type State = (Vec<Isometry3<f64>>, Vec<Vector3<f64>>);
+
 /// What one chunk of points adds to the system in the poses, and what is needed to get the points back.
 struct Chunk {
     /// Lower triangle of 6×6 blocks, row by row: block (a, b), a ≥ b, at a(a+1)/2 + b.
@@ -281,7 +284,7 @@ impl Problem {
     }
 
     /// Poses and points after one damped Gauss–Newton step; `None` if the system is not positive definite.
-    fn step(&self, damping: f64) -> Option<(Vec<Isometry3<f64>>, Vec<Vector3<f64>>)> {
+    fn step(&self, damping: f64) -> Option<State> {
         let views = self.poses.len();
         let rotations: Vec<_> = self.poses.iter().map(|p| *p.rotation.to_rotation_matrix().matrix()).collect();
         let chunk_starts: Vec<usize> = (0..self.points.len()).step_by(POINTS_PER_CHUNK).collect();
@@ -436,8 +439,8 @@ mod tests {
             .collect();
         let points: Vec<_> = (0..points)
             .map(|_| {
-                let (x, y) = (rng.random_range(-25.0..25.0), rng.random_range(-15.0..15.0));
-                Vector3::new(x, y, 75.0 + 6.0 * (0.2 * x as f64).sin() + rng.random_range(-3.0..3.0))
+                let (x, y): (f64, f64) = (rng.random_range(-25.0..25.0), rng.random_range(-15.0..15.0));
+                Vector3::new(x, y, 75.0 + 6.0 * (0.2 * x).sin() + rng.random_range(-3.0..3.0))
             })
             .collect();
         let observations = points

@@ -31,7 +31,13 @@ pub struct Numbered {
 
 impl Numbered {
     pub fn new(count: u64) -> Self {
-        Self { next: 0, count, pool: Pool::new(16), error: None, permission: None }
+        Self {
+            next: 0,
+            count,
+            pool: Pool::new(16),
+            error: None,
+            permission: None,
+        }
     }
 
     pub fn then_error(mut self, message: &'static str) -> Self {
@@ -69,7 +75,11 @@ pub struct Doing<F> {
 
 impl<F: FnMut(&mut Frame) -> Result<(), StageError> + Send> Doing<F> {
     pub fn boxed(name: &'static str, work: F) -> Box<Self> {
-        Box::new(Self { name, work, resets: Arc::default() })
+        Box::new(Self {
+            name,
+            work,
+            resets: Arc::default(),
+        })
     }
 }
 
@@ -92,7 +102,9 @@ pub fn adding(name: &'static str, levels: u8) -> Box<dyn Stage> {
     let mut own = endofield::image::buffer::Image::filled(0, 0, [0; 3]);
     Doing::boxed(name, move |frame: &mut Frame| {
         own.copy_from(&frame.image);
-        own.pixels_mut().iter_mut().for_each(|pixel| *pixel = pixel.map(|level| level.wrapping_add(levels)));
+        own.pixels_mut()
+            .iter_mut()
+            .for_each(|pixel| *pixel = pixel.map(|level| level.wrapping_add(levels)));
         frame.image.swap(&mut own);
         Ok(())
     })
@@ -140,7 +152,15 @@ pub struct Keeping {
 impl Keeping {
     pub fn new(name: &'static str) -> (Self, Seen) {
         let seen = Seen::default();
-        (Self { name, seen: seen.clone(), fail_at: None, gate: None }, seen)
+        (
+            Self {
+                name,
+                seen: seen.clone(),
+                fail_at: None,
+                gate: None,
+            },
+            seen,
+        )
     }
 
     pub fn failing_at(mut self, frame: u64) -> Self {
@@ -167,7 +187,10 @@ impl Sink for Keeping {
         if self.fail_at == Some(frame.id.0) {
             return Err(SinkError("the disk is full".to_owned()));
         }
-        self.seen.frames.lock().unwrap().push(SeenFrame { id: frame.id.0, bytes: frame.image.as_bytes().to_vec() });
+        self.seen.frames.lock().unwrap().push(SeenFrame {
+            id: frame.id.0,
+            bytes: frame.image.as_bytes().to_vec(),
+        });
         Ok(())
     }
 
@@ -187,7 +210,12 @@ pub struct Wandering {
 
 impl Wandering {
     pub fn new(width: usize, height: usize, count: u64) -> Self {
-        Self { size: (width, height), next: 0, count, pool: Pool::new(16) }
+        Self {
+            size: (width, height),
+            next: 0,
+            count,
+            pool: Pool::new(16),
+        }
     }
 }
 

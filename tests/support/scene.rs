@@ -14,8 +14,16 @@ pub fn laparoscope(width: usize, height: usize) -> CameraModel {
     CameraModel {
         width,
         height,
-        intrinsics: Intrinsics { fx: focal, fy: focal, cx: width as f64 / 2.0 - 0.5, cy: height as f64 / 2.0 - 0.5 },
-        distortion: Distortion::BrownConrady { k: [-0.25, 0.06, 0.0, 0.0, 0.0, 0.0], p: [0.0005, -0.0003] },
+        intrinsics: Intrinsics {
+            fx: focal,
+            fy: focal,
+            cx: width as f64 / 2.0 - 0.5,
+            cy: height as f64 / 2.0 - 0.5,
+        },
+        distortion: Distortion::BrownConrady {
+            k: [-0.25, 0.06, 0.0, 0.0, 0.0, 0.0],
+            p: [0.0005, -0.0003],
+        },
     }
 }
 
@@ -34,10 +42,19 @@ pub fn picture(width: usize, height: usize, number: u64) -> Image<Rgb8> {
             let (u, v) = (x as f64 + number as f64 * 0.7, y as f64 + number as f64 * 0.3);
             let texture = 20.0 * (u * 0.21).sin() * (v * 0.17).cos() + 12.0 * (u * 0.05 + v * 0.09).sin();
             let lamp = (0..6).any(|spot| {
-                let (sx, sy) = (width as f64 * (0.25 + 0.09 * spot as f64), height as f64 * (0.35 + 0.06 * spot as f64));
+                let (sx, sy) = (
+                    width as f64 * (0.25 + 0.09 * spot as f64),
+                    height as f64 * (0.35 + 0.06 * spot as f64),
+                );
                 (x as f64 - sx).hypot(y as f64 - sy) < 2.0 + spot as f64 * 0.5
             });
-            let level = |base: f64| if lamp { 252.0 } else { (base + texture + noise).clamp(0.0, 255.0) };
+            let level = |base: f64| {
+                if lamp {
+                    252.0
+                } else {
+                    (base + texture + noise).clamp(0.0, 255.0)
+                }
+            };
             image.set(x, y, [level(150.0) as u8, level(75.0) as u8, level(65.0) as u8]);
         }
     }

@@ -88,13 +88,23 @@ impl<'a> Stereo<'a> {
             .collect();
         let coarse = fine.par_iter().map(Plane::halved).collect();
         let fallback = fallback_range(views, settings);
-        let ranges = views.iter().map(|view| depth_range(view, points).unwrap_or(fallback)).collect();
-        Self { settings, fine, coarse, ranges }
+        let ranges = views
+            .iter()
+            .map(|view| depth_range(view, points).unwrap_or(fallback))
+            .collect();
+        Self {
+            settings,
+            fine,
+            coarse,
+            ranges,
+        }
     }
 
     /// Views that cover the survey evenly: farthest-point sampling over where they stand and where they look.
     pub fn reference_views(&self) -> Vec<usize> {
-        let places: Vec<Vector3<f64>> = (0..self.fine.len()).map(|i| self.fine[i].world_from_camera.translation() + self.aim(i) * 0.5).collect();
+        let places: Vec<Vector3<f64>> = (0..self.fine.len())
+            .map(|i| self.fine[i].world_from_camera.translation() + self.aim(i) * 0.5)
+            .collect();
         let mut chosen = vec![places.len() / 2];
         let mut distance: Vec<f64> = vec![f64::INFINITY; places.len()];
         while chosen.len() < self.settings.reference_views.min(places.len()) {
@@ -102,7 +112,9 @@ impl<'a> Stereo<'a> {
             for (d, place) in distance.iter_mut().zip(&places) {
                 *d = d.min((place - last).norm());
             }
-            let next = (0..places.len()).max_by(|&a, &b| distance[a].total_cmp(&distance[b])).unwrap_or(0);
+            let next = (0..places.len())
+                .max_by(|&a, &b| distance[a].total_cmp(&distance[b]))
+                .unwrap_or(0);
             chosen.push(next);
         }
         chosen.sort_unstable();
@@ -146,7 +158,9 @@ impl<'a> Stereo<'a> {
             .collect();
         let mut chosen = Vec::new();
         while chosen.len() < self.settings.neighbours {
-            let Some(best) = (0..scored.len()).max_by(|&a, &b| scored[a].0.total_cmp(&scored[b].0)) else { break };
+            let Some(best) = (0..scored.len()).max_by(|&a, &b| scored[a].0.total_cmp(&scored[b].0)) else {
+                break;
+            };
             let (score, other, side) = scored.swap_remove(best);
             if score < 1e-4 && chosen.len() >= 2 {
                 break;
@@ -161,7 +175,11 @@ impl<'a> Stereo<'a> {
 
     fn longest_baseline(&self, view: usize, neighbours: &[usize]) -> f64 {
         let from = self.fine[view].world_from_camera.translation();
-        neighbours.iter().map(|&n| (self.fine[n].world_from_camera.translation() - from).norm()).fold(0.0, f64::max).max(1e-6)
+        neighbours
+            .iter()
+            .map(|&n| (self.fine[n].world_from_camera.translation() - from).norm())
+            .fold(0.0, f64::max)
+            .max(1e-6)
     }
 
     /// Depth of one view from nothing but the range.
@@ -177,9 +195,20 @@ impl<'a> Stereo<'a> {
         let (width, height) = plane.gray.size();
         // One pixel along the longest epipolar line a step, unless that makes too many.
         let count = (((most - least) * plane.intrinsics.fx * baseline).ceil() as usize).clamp(16, 128);
-        let sweep = Sweep { step: ((most - least) / (count - 1) as f64) as f32, count, radius: 3 };
+        let sweep = Sweep {
+            step: ((most - least) / (count - 1) as f64) as f32,
+            count,
+            radius: 3,
+        };
         let base = Image::filled(width, height, (0.5 * (least + most)) as f32);
-        let (coarse, _) = self.search(plane, &self.coarse, &neighbours, &base, sweep, Smoothness { step: 0.06, jump: 0.5 });
+        let (coarse, _) = self.search(
+            plane,
+            &self.coarse,
+            &neighbours,
+            &base,
+            sweep,
+            Smoothness { step: 0.06, jump: 0.5 },
+        );
         let mut inverse = base;
         for (w, &index) in inverse.pixels_mut().iter_mut().zip(coarse.index.pixels()) {
             *w += sweep.offset(index);
@@ -197,7 +226,9 @@ impl<'a> Stereo<'a> {
             return None;
         }
         let mut base = depth.clone();
-        base.pixels_mut().iter_mut().for_each(|z| *z = if *z > 0.0 { 1.0 / *z } else { 0.0 });
+        base.pixels_mut()
+            .iter_mut()
+            .for_each(|z| *z = if *z > 0.0 { 1.0 / *z } else { 0.0 });
         let filled = completed(&base);
         Some(self.refined(view, &neighbours, &filled, Some(&base), 0.3, 9))
     }
@@ -209,11 +240,30 @@ impl<'a> Stereo<'a> {
 
     /// Around `base`; where `known` is 0 the base is a guess, and depth needs good evidence: views that start from one guess
     /// would otherwise confirm each other's.
-    fn refined(&self, view: usize, neighbours: &[usize], base: &Image<f32>, known: Option<&Image<f32>>, step_px: f64, count: usize) -> DepthMap {
+    fn refined(
+        &self,
+        view: usize,
+        neighbours: &[usize],
+        base: &Image<f32>,
+        known: Option<&Image<f32>>,
+        step_px: f64,
+        count: usize,
+    ) -> DepthMap {
         let plane = &self.fine[view];
         let baseline = self.longest_baseline(view, neighbours);
-        let sweep = Sweep { step: (step_px / (plane.intrinsics.fx * baseline)) as f32, count, radius: 4 };
-        let (found, cost) = self.search(plane, &self.fine, neighbours, base, sweep, Smoothness { step: 0.03, jump: 0.3 });
+        let sweep = Sweep {
+            step: (step_px / (plane.intrinsics.fx * baseline)) as f32,
+            count,
+            radius: 4,
+        };
+        let (found, cost) = self.search(
+            plane,
+            &self.fine,
+            neighbours,
+            base,
+            sweep,
+            Smoothness { step: 0.03, jump: 0.3 },
+        );
         let (width, height) = plane.gray.size();
         let mut depth = Image::filled(width, height, 0.0_f32);
         let mut weight = Image::filled(width, height, 0.0_f32);
@@ -228,15 +278,36 @@ impl<'a> Stereo<'a> {
                 weight.pixels_mut()[i] = heard * (sharpness / 0.2).clamp(0.02, 1.0);
             }
         }
-        DepthMap { depth, weight, intrinsics: plane.intrinsics, world_from_camera: plane.world_from_camera }
+        DepthMap {
+            depth,
+            weight,
+            intrinsics: plane.intrinsics,
+            world_from_camera: plane.world_from_camera,
+        }
     }
 
-    fn search(&self, plane: &Plane, all: &[Plane], neighbours: &[usize], base: &Image<f32>, sweep: Sweep, smoothness: Smoothness) -> (Winners, Image<f32>) {
+    fn search(
+        &self,
+        plane: &Plane,
+        all: &[Plane],
+        neighbours: &[usize],
+        base: &Image<f32>,
+        sweep: Sweep,
+        smoothness: Smoothness,
+    ) -> (Winners, Image<f32>) {
         let (width, height) = plane.gray.size();
         let planes: Vec<&Plane> = neighbours.iter().map(|&n| &all[n]).collect();
         let (mut volume, mut sums) = (Vec::new(), Vec::new());
         costs(plane, &planes, base, sweep, &mut Scratch::default(), &mut volume);
-        aggregate(&volume, width, height, sweep.count, smoothness, &mut Paths::default(), &mut sums);
+        aggregate(
+            &volume,
+            width,
+            height,
+            sweep.count,
+            smoothness,
+            &mut Paths::default(),
+            &mut sums,
+        );
         let found = winners(&sums, width, height, sweep.count);
         let mut cost = found.index.clone();
         for (cost, volume) in cost.pixels_mut().iter_mut().zip(volume.chunks_exact(sweep.count)) {
@@ -251,7 +322,11 @@ pub fn depth_maps(stereo: &Stereo<'_>, references: &[usize], progress: &dyn Prog
     progress.begin("depth", references.len() as u64);
     let maps: Vec<Option<DepthMap>> = (references.par_iter())
         .map(|&view| {
-            let map = if progress.stopping() { None } else { stereo.from_scratch(view) };
+            let map = if progress.stopping() {
+                None
+            } else {
+                stereo.from_scratch(view)
+            };
             progress.advance(1);
             map
         })
@@ -270,14 +345,23 @@ pub fn confirmed(maps: &[DepthMap], agreement: f32) -> Vec<DepthMap> {
         .map(|(index, map)| {
             let mut near: Vec<(f64, usize)> = (0..maps.len())
                 .filter(|&other| other != index)
-                .map(|other| ((maps[other].world_from_camera.translation() - map.world_from_camera.translation()).norm(), other))
+                .map(|other| {
+                    (
+                        (maps[other].world_from_camera.translation() - map.world_from_camera.translation()).norm(),
+                        other,
+                    )
+                })
                 .collect();
             near.sort_by(|a, b| a.0.total_cmp(&b.0));
             near.truncate(8);
             let motions: Vec<(usize, nalgebra::Matrix3<f32>, Vector3<f32>)> = (near.iter())
                 .map(|&(_, other)| {
                     let motion = maps[other].world_from_camera.inverse() * map.world_from_camera;
-                    (other, motion.rotation().to_rotation_matrix().matrix().cast(), motion.translation().cast())
+                    (
+                        other,
+                        motion.rotation().to_rotation_matrix().matrix().cast(),
+                        motion.translation().cast(),
+                    )
                 })
                 .collect();
             let mut out = map.clone();
@@ -288,8 +372,15 @@ pub fn confirmed(maps: &[DepthMap], agreement: f32) -> Vec<DepthMap> {
                     if z <= 0.0 {
                         continue;
                     }
-                    let ray = Vector3::new((x as f32 - k.cx as f32) / k.fx as f32, (y as f32 - k.cy as f32) / k.fy as f32, 1.0);
-                    let agreed = motions.iter().filter(|(other, r, t)| agrees(&maps[*other], &(r * ray * z + t), agreement)).count();
+                    let ray = Vector3::new(
+                        (x as f32 - k.cx as f32) / k.fx as f32,
+                        (y as f32 - k.cy as f32) / k.fy as f32,
+                        1.0,
+                    );
+                    let agreed = motions
+                        .iter()
+                        .filter(|(other, r, t)| agrees(&maps[*other], &(r * ray * z + t), agreement))
+                        .count();
                     if agreed == 0 {
                         out.depth.set(x, y, 0.0);
                         out.weight.set(x, y, 0.0);
