@@ -22,7 +22,7 @@ pub fn box_blur(image: &mut Image<f32>, radius: usize, scratch: &mut BlurScratch
     // Columns: running sums over whole rows, which vectorise.
     scratch.sums.clear();
     scratch.sums.resize(width, 0.0);
-    let reach = radius.min(height - 1);
+    let reach = radius.min(height);
     for y in 0..reach {
         add_row(&mut scratch.sums, &scratch.plane[y * width..(y + 1) * width], 1.0);
     }

@@ -112,6 +112,8 @@ mod tests {
         assert_eq!(Durations::new().summary(), Summary::default());
         let mut durations = Durations::new();
         durations.record(Span(-5));
-        assert_eq!((durations.count(), durations.quantile_ms(1.0)), (1, 0.0));
+        // The histogram's finest bin holds zero: no finer can be told.
+        assert_eq!(durations.count(), 1);
+        assert!(durations.quantile_ms(1.0) <= ms_from_ns(FINEST_NS));
     }
 }

@@ -183,7 +183,8 @@ mod tests {
                     sum += coat(&facing, to_lamp, &film) / std::f64::consts::PI * area;
                 }
             }
-            assert!(sum < 1.0 && sum > 0.75, "tilt {tilt}: {sum}");
+            // Schlick's masking, squared, at a tilt of 1 rad: (0.54/(0.54·0.85 + 0.15))² ≈ 0.79 of what Smith's keeps (0.9).
+            assert!(sum < 1.0 && sum > 0.71, "tilt {tilt}: {sum}");
         }
     }
 
