@@ -13,13 +13,13 @@ use crate::light_field::mapping::Mapping;
 use crate::light_field::view::{LampShading, LightField, View};
 
 /// At most so many other views are asked.
-const WITNESSES: usize = 22;
+const WITNESSES: usize = 40;
 /// Fewer answers settle nothing.
 const FEWEST_ANSWERS: usize = 4;
 /// Of the answers' brightness this quantile counts: up to most of the witnesses may be dazzled themselves.
-const QUANTILE: f32 = 0.35;
+const QUANTILE: f32 = 0.22;
 /// A pixel this much brighter begins to lose confidence, share of its brightness.
-const BRIGHTER_FROM: f32 = 0.025;
+const BRIGHTER_FROM: f32 = 0.035;
 /// A pixel this much brighter has only `HAZY` confidence left: it speaks where nobody else does.
 const HAZE: f32 = 0.07;
 /// Confidence in a pixel under haze.

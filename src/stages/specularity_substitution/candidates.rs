@@ -14,6 +14,9 @@ pub const MAX_VIEWS: usize = 8;
 /// Places of a hole that are asked for, at most: one bit each.
 pub const MAX_PLACES: usize = 64;
 
+/// So many views are enough once every place was seen.
+const ENOUGH_VIEWS: usize = 4;
+
 /// Every place of a hole should be seen by so many views.
 const WANTED_SIGHTINGS: usize = 3;
 
@@ -93,10 +96,12 @@ impl CandidateSearch {
                     .sum()
             };
             let wanted = worth(u64::MAX);
-            if wanted == 0.0 {
+            let unseen = (0..hole.len()).any(|p| sightings[p] == 0);
+            if wanted == 0.0 || !unseen && chosen.len() >= ENOUGH_VIEWS {
                 break;
             }
             let cost = |sight: &Sight| sight.penalty - SIGHTING_WORTH * worth(sight.places) / wanted;
+            // Places that no view saw stay unseen: nothing more is gained for them.
             let Some(best) = (0..self.sights.len()).min_by(|&a, &b| cost(&self.sights[a]).total_cmp(&cost(&self.sights[b])))
             else {
                 break;

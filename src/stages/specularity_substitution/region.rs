@@ -15,6 +15,9 @@ use crate::stages::specularity_substitution::ring::{Detail, luminance, shift_bet
 use crate::stages::specularity_substitution::stage::Settings;
 use crate::stages::specularity_substitution::warp::{WarpedView, Window};
 
+/// On the ring a live pixel counts as at most this much brighter than what was measured, levels.
+const BRIGHTER_AT_MOST: f32 = 4.0;
+
 /// What a region looks at of the live frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Scene<'a> {
@@ -179,32 +182,22 @@ impl Workbench {
             };
             let drawn = &mut self.views[slot];
             let mut shift = [0.0_f32; 2];
-            drawn.draw(view, &mapping, window, &self.depth, shift, &self.fine);
             if settings.align_on_ring {
                 let limit = settings.max_shift_px * scene.scale;
                 for _ in 0..settings.ring_rounds {
+                    drawn.draw(view, &mapping, window, &self.depth, shift, None);
                     let (color, confidence) = (&drawn.color, &drawn.confidence);
-                    self.drawn_detail.measure(
-                        window,
-                        |i| color[i],
-                        |i| good[i] && confidence[i] > 0.5,
-                        sigma,
-                        &mut self.scratch,
-                    );
                     let usable = |i: usize| good[i] && confidence[i] > 0.5;
-                    let Some(step) = shift_between(&self.live_detail, &self.drawn_detail, usable, scene.scale) else {
-                        break;
-                    };
-                    shift = [
-                        (shift[0] + step[0]).clamp(-limit, limit),
-                        (shift[1] + step[1]).clamp(-limit, limit),
-                    ];
-                    drawn.draw(view, &mapping, window, &self.depth, shift, &self.fine);
-                    if step[0].abs().max(step[1].abs()) < 0.05 {
+                    self.drawn_detail.measure(window, |i| color[i], usable, sigma, &mut self.scratch);
+                    let Some(step) = shift_between(&self.live_detail, &self.drawn_detail, usable, scene.scale) else { break };
+                    shift = [(shift[0] + step[0]).clamp(-limit, limit), (shift[1] + step[1]).clamp(-limit, limit)];
+                    // A step is right to about a tenth of its length.
+                    if step[0].abs().max(step[1].abs()) < 0.4 {
                         break;
                     }
                 }
             }
+            drawn.draw(view, &mapping, window, &self.depth, shift, Some(&self.fine));
             sum += shift[0] * shift[0] + shift[1] * shift[1];
             count += 1;
         }
@@ -261,7 +254,8 @@ impl Workbench {
         for (index, good) in self.good.iter().enumerate() {
             if *good && self.belief[index] > 0.0 {
                 let level = luminance(self.live[index]);
-                let d = level - luminance(self.blended[index]);
+                // The lamp only adds light: haze that no detector saw must not condemn a good fit.
+                let d = (level - luminance(self.blended[index])).min(BRIGHTER_AT_MOST);
                 difference += d * d;
                 let texture = self.live_detail.values.pixels()[index] * level;
                 detail += texture * texture;

@@ -226,16 +226,6 @@ impl SpecularitySubstitution {
             shift += filled.shift_px * filled.shift_px;
             count += 1.0;
         }
-        for f in self.regions.iter().take(self.windows.len()) {
-            eprintln!(
-                "DBG {} {:?} res {:.2} shift {:.2} area {}",
-                frame.id.0,
-                f.verdict,
-                f.residual_levels,
-                f.shift_px,
-                f.window.area()
-            );
-        }
         if let Some(alignment) = &mut frame.alignment
             && count > 0.0
         {
