@@ -76,7 +76,7 @@ struct BuildArgs {
     #[arg(short, long, value_name = "LF")]
     output: PathBuf,
     /// Views wanted.
-    #[arg(long, value_name = "N", default_value_t = 64)]
+    #[arg(long, value_name = "N", default_value_t = 96)]
     views: usize,
     /// Trust the poses as they are: no refinement by the pictures.
     #[arg(long)]

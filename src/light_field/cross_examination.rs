@@ -24,8 +24,12 @@ const BRIGHTER_FROM: f32 = 0.035;
 const HAZE: f32 = 0.07;
 /// Confidence in a pixel under haze.
 const HAZY: f32 = 0.12;
-/// A pixel this much brighter shows the lamp.
+/// A pixel this much brighter shows the lamp as well as tissue.
 const BRIGHTER_TO: f32 = 0.13;
+/// Its confidence then: heard only where every view is dazzled, the least dazzled loudest.
+const DAZZLED: f32 = 0.035;
+/// A pixel this much brighter shows the lamp only.
+const LAMP_ONLY: f32 = 0.6;
 /// A pixel this much darker shows something else: steel, a shadow, the surround.
 const DARKER: f32 = 0.12;
 /// Added to both sides, levels: in the dark ratios are noise.
@@ -91,12 +95,14 @@ fn examined(light_field: &LightField, index: usize, filler: &mut HoleFiller) -> 
 
 /// Confidence in a pixel by how much brighter it is than the witnesses say, as a share.
 fn trust_in(ratio: f32) -> f32 {
-    if ratio < -DARKER || ratio >= BRIGHTER_TO {
+    if ratio < -DARKER || ratio >= LAMP_ONLY {
         0.0
+    } else if ratio >= BRIGHTER_TO {
+        DAZZLED * ((LAMP_ONLY - ratio) / (LAMP_ONLY - BRIGHTER_TO)).powi(2)
     } else if ratio <= HAZE {
         1.0 - (1.0 - HAZY) * ((ratio - BRIGHTER_FROM) / (HAZE - BRIGHTER_FROM)).clamp(0.0, 1.0)
     } else {
-        HAZY * (BRIGHTER_TO - ratio) / (BRIGHTER_TO - HAZE)
+        DAZZLED + (HAZY - DAZZLED) * (BRIGHTER_TO - ratio) / (BRIGHTER_TO - HAZE)
     }
 }
 

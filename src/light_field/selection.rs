@@ -40,7 +40,7 @@ pub struct SelectionSettings {
 impl Default for SelectionSettings {
     fn default() -> Self {
         Self {
-            target_views: 90,
+            target_views: 96,
             min_step_rad: 0.006,
             scene_depth_mm: 75.0,
             min_relative_sharpness: 0.6,

@@ -26,6 +26,9 @@ const SIGHTING_WORTH: f64 = 0.5;
 /// The first sighting of a place is worth more than the second, and that more than the third.
 const WORTH_OF_NEXT: [f64; WANTED_SIGHTINGS] = [1.0, 0.2, 0.1];
 
+/// What a hazy sight of a place is worth that no chosen view sees clean.
+const WORTH_OF_A_GLIMPSE: f64 = 0.3;
+
 /// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
 const HEARD_FROM: u8 = 25;
 
@@ -46,8 +49,10 @@ pub struct Candidate {
 struct Sight {
     penalty: f64,
     view: usize,
-    /// One bit a place.
+    /// Seen clean: one bit a place.
     places: u64,
+    /// Seen at least through haze: one bit a place.
+    hazy: u64,
 }
 
 /// Looks for views; keeps its memory.
@@ -77,30 +82,33 @@ impl CandidateSearch {
         self.sights.clear();
         for (index, view) in light_field.views.iter().enumerate() {
             if let Some(penalty) = penalty(view, eye, &centre) {
-                let places = places_seen(view, hole);
-                if places != 0 {
-                    self.sights.push(Sight {
-                        penalty,
-                        view: index,
-                        places,
-                    });
+                let (places, hazy) = (places_seen(view, hole, HEARD_FROM), places_seen(view, hole, 1));
+                if hazy != 0 {
+                    self.sights.push(Sight { penalty, view: index, places, hazy });
                 }
             }
         }
         let mut sightings = [0_usize; MAX_PLACES];
+        let mut glimpses = [0_usize; MAX_PLACES];
         while chosen.len() < MAX_VIEWS {
-            let worth = |bits: u64| -> f64 {
-                (0..hole.len())
-                    .filter(|&p| bits >> p & 1 != 0)
-                    .filter_map(|p| WORTH_OF_NEXT.get(sightings[p]))
-                    .sum()
+            let worth = |clean: u64, hazy: u64| -> f64 {
+                let of = |p: usize| {
+                    if clean >> p & 1 != 0 {
+                        WORTH_OF_NEXT.get(sightings[p]).copied().unwrap_or(0.0)
+                    } else if hazy >> p & 1 != 0 && sightings[p] == 0 && glimpses[p] < 2 {
+                        WORTH_OF_A_GLIMPSE
+                    } else {
+                        0.0
+                    }
+                };
+                (0..hole.len()).map(of).sum()
             };
-            let wanted = worth(u64::MAX);
-            let unseen = (0..hole.len()).any(|p| sightings[p] == 0);
+            let wanted = worth(u64::MAX, 0);
+            let unseen = (0..hole.len()).any(|p| sightings[p] == 0 && glimpses[p] < 2);
             if wanted == 0.0 || !unseen && chosen.len() >= ENOUGH_VIEWS {
                 break;
             }
-            let cost = |sight: &Sight| sight.penalty - SIGHTING_WORTH * worth(sight.places) / wanted;
+            let cost = |sight: &Sight| sight.penalty - SIGHTING_WORTH * worth(sight.places, sight.hazy) / wanted;
             // Places that no view saw stay unseen: nothing more is gained for them.
             let Some(best) = (0..self.sights.len()).min_by(|&a, &b| cost(&self.sights[a]).total_cmp(&cost(&self.sights[b])))
             else {
@@ -109,6 +117,7 @@ impl CandidateSearch {
             let sight = self.sights.swap_remove(best);
             for (place, count) in sightings.iter_mut().enumerate().take(hole.len()) {
                 *count += (sight.places >> place & 1) as usize;
+                glimpses[place] += (sight.hazy >> place & 1) as usize;
             }
             // Until the threshold is known the weight holds the penalty.
             chosen.push(Candidate {
@@ -145,8 +154,8 @@ fn border_distance(camera: &CameraModel, x: f64, y: f64) -> f64 {
         .min(camera.height as f64 - 1.0 - y)
 }
 
-/// The places that the view saw free of lamp and obstacle, one bit each.
-fn places_seen(view: &View, places: &[Vector3<f64>]) -> u64 {
+/// The places that the view saw unhidden and with at least some confidence, one bit each.
+fn places_seen(view: &View, places: &[Vector3<f64>], least_confidence: u8) -> u64 {
     let camera_from_world = view.world_from_camera.inverse();
     let mut bits = 0;
     for (index, place) in places.iter().enumerate() {
@@ -157,7 +166,7 @@ fn places_seen(view: &View, places: &[Vector3<f64>]) -> u64 {
                 && y >= 0.0
                 && x < view.camera.width as f64
                 && y < view.camera.height as f64
-                && view.confidence.at(x as usize, y as usize) >= HEARD_FROM
+                && view.confidence.at(x as usize, y as usize) >= least_confidence
                 && is_unoccluded(view.depth.at(x as usize, y as usize), p.coords.z as f32)
         });
         bits |= u64::from(seen) << index;
