@@ -32,8 +32,10 @@ const BAD_USAGE: u8 = 2;
 /// Endoscope video, clearer than the endoscope saw it.
 #[derive(Debug, Parser)]
 #[command(name = "endofield", version, about, propagate_version = true)]
-#[command(after_help = "See it run without hardware:\n  endofield demo\n\nEnhance a video:\n  endofield process operation.mp4 -o enhanced.mp4\n\n\
-    Exit code: 0 all of the work was done, 1 it was not, 2 bad usage, 130 after Ctrl-C (what was written is playable).")]
+#[command(
+    after_help = "See it run without hardware:\n  endofield demo\n\nEnhance a video:\n  endofield process operation.mp4 -o enhanced.mp4\n\n\
+    Exit code: 0 all of the work was done, 1 it was not, 2 bad usage, 130 after Ctrl-C (what was written is playable)."
+)]
 struct Cli {
     #[command(flatten)]
     globals: Globals,
@@ -87,7 +89,12 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
     }
     let console = Console::new(cli.globals.progress, Arc::clone(&stop));
     console.install_log(&cli.globals)?;
-    let context = Context { config: cli.globals.config()?, force: cli.globals.force, console, stop };
+    let context = Context {
+        config: cli.globals.config()?,
+        force: cli.globals.force,
+        console,
+        stop,
+    };
     let result = run(cli.command, &context);
     match result {
         Ok(Ended::Complete) if context.stop.load(Ordering::Acquire) => Ok(Ended::Interrupted),
@@ -122,8 +129,13 @@ fn code_from(result: anyhow::Result<Ended>) -> ExitCode {
         Ok(Ended::Interrupted) => ExitCode::from(INTERRUPTED),
         Err(error) => {
             console::print_error(&error);
-            let of_usage = error.downcast_ref::<UsageError>().is_some() || matches!(error.downcast_ref(), Some(ConfigError::Set { .. }));
-            if of_usage { ExitCode::from(BAD_USAGE) } else { ExitCode::FAILURE }
+            let of_usage =
+                error.downcast_ref::<UsageError>().is_some() || matches!(error.downcast_ref(), Some(ConfigError::Set { .. }));
+            if of_usage {
+                ExitCode::from(BAD_USAGE)
+            } else {
+                ExitCode::FAILURE
+            }
         }
     }
 }

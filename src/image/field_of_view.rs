@@ -27,7 +27,12 @@ pub struct Settings {
 
 impl Default for Settings {
     fn default() -> Self {
-        Self { darkest_surround_levels: 40, step_levels: 12, min_agreement: 0.35, seed: 1 }
+        Self {
+            darkest_surround_levels: 40,
+            step_levels: 12,
+            min_agreement: 0.35,
+            seed: 1,
+        }
     }
 }
 
@@ -94,7 +99,9 @@ fn surround_level(brightest: &Mask) -> u8 {
     let (width, height) = brightest.size();
     let side = (width.min(height) / 24).max(4);
     let mut levels = [(0, 0), (width - side, 0), (0, height - side), (width - side, height - side)].map(|(left, top)| {
-        let mut values: Vec<u8> = (top..top + side).flat_map(|y| brightest.row(y)[left..left + side].to_vec()).collect();
+        let mut values: Vec<u8> = (top..top + side)
+            .flat_map(|y| brightest.row(y)[left..left + side].to_vec())
+            .collect();
         values.sort_unstable();
         values[values.len() * 9 / 10]
     });
@@ -137,7 +144,9 @@ fn circle_through(points: &[(f64, f64)], side: f64, settings: &Settings) -> Opti
     let mut best: Option<(usize, Circle)> = None;
     for _ in 0..DRAWS {
         let mut draw = || points[rng.random_range(0..points.len())];
-        let Some(circle) = circle_of_three(draw(), draw(), draw()) else { continue };
+        let Some(circle) = circle_of_three(draw(), draw(), draw()) else {
+            continue;
+        };
         if !(0.3 * side..1.5 * side).contains(&circle.radius) {
             continue;
         }
@@ -163,7 +172,11 @@ fn circle_of_three(a: (f64, f64), b: (f64, f64), c: (f64, f64)) -> Option<Circle
     }
     let (bb, cc) = (bx * bx + by * by, cx * cx + cy * cy);
     let (x, y) = ((cy * bb - by * cc) / cross, (bx * cc - cx * bb) / cross);
-    Some(Circle { x: a.0 + x, y: a.1 + y, radius: x.hypot(y) })
+    Some(Circle {
+        x: a.0 + x,
+        y: a.1 + y,
+        radius: x.hypot(y),
+    })
 }
 
 /// Least squares in x² + y² = 2 a x + 2 b y + c (Kåsa 1976).
@@ -172,7 +185,10 @@ fn fitted_circle(points: &[(f64, f64)]) -> Option<Circle> {
     if n < 12.0 {
         return None;
     }
-    let (mx, my) = (points.iter().map(|p| p.0).sum::<f64>() / n, points.iter().map(|p| p.1).sum::<f64>() / n);
+    let (mx, my) = (
+        points.iter().map(|p| p.0).sum::<f64>() / n,
+        points.iter().map(|p| p.1).sum::<f64>() / n,
+    );
     let mut normal = nalgebra::Matrix3::zeros();
     let mut right = nalgebra::Vector3::zeros();
     for p in points {
@@ -183,7 +199,11 @@ fn fitted_circle(points: &[(f64, f64)]) -> Option<Circle> {
     }
     let s = normal.cholesky()?.solve(&right);
     let radius = (s.z + s.x * s.x + s.y * s.y).sqrt();
-    radius.is_finite().then_some(Circle { x: s.x + mx, y: s.y + my, radius })
+    radius.is_finite().then_some(Circle {
+        x: s.x + mx,
+        y: s.y + my,
+        radius,
+    })
 }
 
 /// The circle, if across its rim the picture steps up within a few pixels.
@@ -218,8 +238,14 @@ fn mask_of(brightest: &Mask, circle: Circle, threshold: u8) -> Mask {
     // A side is straight where a whole margin of the disc's rows (columns) never gets bright.
     let row_is_bright = |y: usize| has_bright((0..width).filter(|x| inside(*x, y)).map(|x| brightest.at(x, y)), threshold);
     let column_is_bright = |x: usize| has_bright((0..height).filter(|y| inside(x, *y)).map(|y| brightest.at(x, y)), threshold);
-    let (top, bottom) = ((0..height).find(|y| row_is_bright(*y)), (0..height).rev().find(|y| row_is_bright(*y)));
-    let (left, right) = ((0..width).find(|x| column_is_bright(*x)), (0..width).rev().find(|x| column_is_bright(*x)));
+    let (top, bottom) = (
+        (0..height).find(|y| row_is_bright(*y)),
+        (0..height).rev().find(|y| row_is_bright(*y)),
+    );
+    let (left, right) = (
+        (0..width).find(|x| column_is_bright(*x)),
+        (0..width).rev().find(|x| column_is_bright(*x)),
+    );
     if let (Some(top), Some(bottom), Some(left), Some(right)) = (top, bottom, left, right) {
         for y in top..=bottom {
             for x in (left..=right).filter(|x| inside(*x, y)) {
@@ -255,7 +281,13 @@ mod tests {
                 let tissue = (170.0 * (1.0 - 0.75 * off * off)).max(4.0) as u8;
                 let text = x < 24 && y < 12 && (x + y) % 3 > 0;
                 let inside = disc.is_none_or(|c| (x as f64 - c.x).hypot(y as f64 - c.y) <= c.radius);
-                let value = if inside { tissue.saturating_add(noise) } else if text { 200 } else { noise };
+                let value = if inside {
+                    tissue.saturating_add(noise)
+                } else if text {
+                    200
+                } else {
+                    noise
+                };
                 image.set(x, y, [value, value / 2, value / 2]);
             }
         }
@@ -264,10 +296,25 @@ mod tests {
 
     #[test]
     fn a_disc_is_found_cropped_or_not() {
-        for truth in [Circle { x: 158.0, y: 121.0, radius: 112.0 }, Circle { x: 165.0, y: 118.0, radius: 139.0 }] {
+        for truth in [
+            Circle {
+                x: 158.0,
+                y: 121.0,
+                radius: 112.0,
+            },
+            Circle {
+                x: 165.0,
+                y: 118.0,
+                radius: 139.0,
+            },
+        ] {
             let pictures: Vec<_> = (0..3).map(|seed| picture(Some(truth), seed)).collect();
             let found = find(&pictures.iter().collect::<Vec<_>>(), &Settings::default()).unwrap();
-            assert!((found.circle.x - truth.x).abs() < 1.0 && (found.circle.y - truth.y).abs() < 1.0, "{:?}", found.circle);
+            assert!(
+                (found.circle.x - truth.x).abs() < 1.0 && (found.circle.y - truth.y).abs() < 1.0,
+                "{:?}",
+                found.circle
+            );
             assert!((found.circle.radius - truth.radius).abs() < 1.0, "{:?}", found.circle);
         }
     }

@@ -32,7 +32,11 @@ const fn weights() -> [[i32; 4]; 32] {
 }
 
 const fn rounded(value: f64) -> i32 {
-    if value < 0.0 { (value - 0.5) as i32 } else { (value + 0.5) as i32 }
+    if value < 0.0 {
+        (value - 0.5) as i32
+    } else {
+        (value + 0.5) as i32
+    }
 }
 
 /// The fastest kernel for this machine.
@@ -60,7 +64,12 @@ fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
 
 fn place_of(entry: u32, base: u32, width: usize) -> Place {
     let (pixel, fx, fy) = unpacked(entry, base);
-    Place { x: (pixel % width) as i32, y: (pixel / width) as i32, fx: fx as u8, fy: fy as u8 }
+    Place {
+        x: (pixel % width) as i32,
+        y: (pixel / width) as i32,
+        fx: fx as u8,
+        fy: fy as u8,
+    }
 }
 
 fn to_byte(sum: i32) -> u8 {
@@ -86,7 +95,7 @@ pub(crate) fn at(source: &Image<Rgb8>, place: Place) -> Rgb8 {
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
     use std::arch::x86_64::{
-        __m128i, _mm_set_epi64x, _mm_set_epi8, _mm_shuffle_epi8, _mm256_add_epi32, _mm256_cvtepu8_epi16, _mm256_extract_epi32,
+        __m128i, _mm_set_epi8, _mm_set_epi64x, _mm_shuffle_epi8, _mm256_add_epi32, _mm256_cvtepu8_epi16, _mm256_extract_epi32,
         _mm256_hadd_epi32, _mm256_madd_epi16, _mm256_mullo_epi32, _mm256_set1_epi32, _mm256_set1_epi64x, _mm256_setzero_si256,
     };
 
@@ -132,15 +141,21 @@ mod avx2 {
         let mut sums = _mm256_setzero_si256();
         for (k, weight) in WEIGHTS[(fy & 31) as usize].iter().enumerate() {
             let chunk = bytes.get(start + 3 * width * k..)?.first_chunk::<16>()?;
-            let (low, high) = (u64::from_le_bytes(*chunk.first_chunk::<8>()?), u64::from_le_bytes(*chunk.last_chunk::<8>()?));
+            let (low, high) = (
+                u64::from_le_bytes(*chunk.first_chunk::<8>()?),
+                u64::from_le_bytes(*chunk.last_chunk::<8>()?),
+            );
             let neighbours = _mm_shuffle_epi8(_mm_set_epi64x(high as i64, low as i64), order);
             let row = _mm256_madd_epi16(_mm256_cvtepu8_epi16(neighbours), across);
             sums = _mm256_add_epi32(sums, _mm256_mullo_epi32(row, _mm256_set1_epi32(*weight)));
         }
         // Two halves a channel: r r g g | b b 0 0.
         let halves = _mm256_hadd_epi32(sums, sums);
-        let [r, g, b] =
-            [_mm256_extract_epi32::<0>(halves), _mm256_extract_epi32::<1>(halves), _mm256_extract_epi32::<4>(halves)];
+        let [r, g, b] = [
+            _mm256_extract_epi32::<0>(halves),
+            _mm256_extract_epi32::<1>(halves),
+            _mm256_extract_epi32::<4>(halves),
+        ];
         Some([to_byte(r), to_byte(g), to_byte(b)])
     }
 }
@@ -152,7 +167,12 @@ mod tests {
 
     #[test]
     fn a_constant_stays_and_a_line_stays() {
-        let source = Image::from_vec(40, 40, (0..1600).map(|i| [77, (i % 40 * 6) as u8, (i / 40 * 5) as u8]).collect()).unwrap();
+        let source = Image::from_vec(
+            40,
+            40,
+            (0..1600).map(|i| [77, (i % 40 * 6) as u8, (i / 40 * 5) as u8]).collect(),
+        )
+        .unwrap();
         let table = RemapTable::new((30, 30), (40, 40), |x, y| Some((x as f64 + 4.41, y as f64 + 5.23))).unwrap();
         let mut out = Image::filled(0, 0, [0; 3]);
         table.remap_rgb(&source, &mut out, Interpolation::Bicubic).unwrap();
@@ -169,8 +189,18 @@ mod tests {
 
     #[test]
     fn row_and_border_kernels_agree() {
-        let source = Image::from_vec(24, 16, (0..384_u32).map(|i| [(i * 7 % 251) as u8, (i * 13 % 241) as u8, (i * 29 % 239) as u8]).collect()).unwrap();
-        let table = RemapTable::new((24, 16), (24, 16), |x, y| Some((x as f64 * 1.02 - 0.6, y as f64 * 0.97 + 0.3))).unwrap();
+        let source = Image::from_vec(
+            24,
+            16,
+            (0..384_u32)
+                .map(|i| [(i * 7 % 251) as u8, (i * 13 % 241) as u8, (i * 29 % 239) as u8])
+                .collect(),
+        )
+        .unwrap();
+        let table = RemapTable::new((24, 16), (24, 16), |x, y| {
+            Some((x as f64 * 1.02 - 0.6, y as f64 * 0.97 + 0.3))
+        })
+        .unwrap();
         let mut out = Image::filled(0, 0, [0; 3]);
         table.remap_rgb(&source, &mut out, Interpolation::Bicubic).unwrap();
         for y in 0..16 {

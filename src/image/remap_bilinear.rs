@@ -84,14 +84,20 @@ mod avx2 {
         }
         // Weights per 32 bits: bytes (32−fx, fx, 32−fx, fx), words (32−fy, fy).
         let (low_five, all) = (_mm_set1_epi32(31), _mm_set1_epi32(32));
-        let (fx, fy) = (_mm_and_si128(entries, low_five), _mm_and_si128(_mm_srli_epi32::<5>(entries), low_five));
+        let (fx, fy) = (
+            _mm_and_si128(entries, low_five),
+            _mm_and_si128(_mm_srli_epi32::<5>(entries), low_five),
+        );
         let across = _mm_or_si128(_mm_sub_epi32(all, fx), _mm_slli_epi32::<8>(fx));
         let across = _mm256_broadcastsi128_si256(_mm_or_si128(across, _mm_slli_epi32::<16>(across)));
         let down = _mm256_broadcastsi128_si256(_mm_or_si128(_mm_sub_epi32(all, fy), _mm_slli_epi32::<16>(fy)));
         let window = |entry: u32| {
             let at = 3 * unpacked(entry, base).0;
             let window = bytes.get(at..at + reach)?;
-            Some((i64::from_le_bytes(*window.first_chunk::<8>()?), i64::from_le_bytes(*window.last_chunk::<8>()?)))
+            Some((
+                i64::from_le_bytes(*window.first_chunk::<8>()?),
+                i64::from_le_bytes(*window.last_chunk::<8>()?),
+            ))
         };
         let sums = |first: u32, second: u32, lanes: __m256i| {
             let ((top0, bottom0), (top1, bottom1)) = (window(first)?, window(second)?);
@@ -136,7 +142,9 @@ mod tests {
 
     /// The plainest possible: f64, at the position that the table says.
     fn reference(table: &RemapTable, source: &Image<Rgb8>, x: usize, y: usize) -> [f64; 3] {
-        let Some((sx, sy)) = table.position(x, y) else { return [0.0; 3] };
+        let Some((sx, sy)) = table.position(x, y) else {
+            return [0.0; 3];
+        };
         let at = |x: f64, y: f64, c: usize| {
             if x < 0.0 || y < 0.0 || x >= source.width() as f64 || y >= source.height() as f64 {
                 0.0
@@ -154,7 +162,10 @@ mod tests {
 
     #[test]
     fn agrees_with_the_plain_twin() {
-        for (seed, (w, h)) in [(67, 41), (128, 64), (3, 3), (1, 5), (2, 2), (200, 9)].into_iter().enumerate() {
+        for (seed, (w, h)) in [(67, 41), (128, 64), (3, 3), (1, 5), (2, 2), (200, 9)]
+            .into_iter()
+            .enumerate()
+        {
             let source = noise(w, h, seed as u64);
             let table = RemapTable::new((w + 3, h), (w, h), |x, y| {
                 let (x, y) = (x as f64, y as f64);
@@ -180,7 +191,13 @@ mod tests {
         let source = noise(131, 57, 9);
         let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(1);
         let entries: Vec<u32> = (0..131)
-            .map(|_| if rng.random_bool(0.1) { OUTSIDE } else { rng.random_range(0..131 * 55) << 10 | rng.random_range(0..1024) })
+            .map(|_| {
+                if rng.random_bool(0.1) {
+                    OUTSIDE
+                } else {
+                    rng.random_range(0..131 * 55) << 10 | rng.random_range(0..1024)
+                }
+            })
             .collect();
         let (mut plain, mut fast) = (vec![[1; 3]; 131], vec![[2; 3]; 131]);
         row(&entries, &[5, 0, 70], &source, &mut plain);

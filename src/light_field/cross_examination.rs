@@ -57,7 +57,12 @@ fn examined(light_field: &LightField, index: usize, filler: &mut HoleFiller) -> 
     filler.fill(&mut depth, DEPTH_REACH_LEVELS);
     let mut nearest: Vec<(f64, usize)> = (light_field.views.iter().enumerate())
         .filter(|&(other, _)| other != index)
-        .map(|(other, v)| ((v.world_from_camera.translation() - view.world_from_camera.translation()).norm(), other))
+        .map(|(other, v)| {
+            (
+                (v.world_from_camera.translation() - view.world_from_camera.translation()).norm(),
+                other,
+            )
+        })
         .collect();
     nearest.sort_by(|a, b| a.0.total_cmp(&b.0));
     // The very nearest are dazzled at the same place: witnesses are spread over all distances.
@@ -161,6 +166,10 @@ fn common_brightness(view: &View, shading: &LampShading, color: [f32; 3], x: f32
     let (u, v) = ((x - k.cx as f32) / k.fx as f32, (y - k.cy as f32) / k.fy as f32);
     let rho2 = u * u + v * v;
     let luma = 0.299 * color[0] * view.gain[0] + 0.587 * color[1] * view.gain[1] + 0.114 * color[2] * view.gain[2];
-    let lamp = if shading.is_flat() { 0.0 } else { shading.log_brightness(z * (1.0 + rho2).sqrt(), rho2) };
+    let lamp = if shading.is_flat() {
+        0.0
+    } else {
+        shading.log_brightness(z * (1.0 + rho2).sqrt(), rho2)
+    };
     (luma + DARK_LEVELS) * (-lamp).exp()
 }

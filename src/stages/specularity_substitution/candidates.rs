@@ -84,7 +84,12 @@ impl CandidateSearch {
             if let Some(penalty) = penalty(view, eye, &centre) {
                 let (places, hazy) = (places_seen(view, hole, HEARD_FROM), places_seen(view, hole, 1));
                 if hazy != 0 {
-                    self.sights.push(Sight { penalty, view: index, places, hazy });
+                    self.sights.push(Sight {
+                        penalty,
+                        view: index,
+                        places,
+                        hazy,
+                    });
                 }
             }
         }

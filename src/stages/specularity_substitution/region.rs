@@ -188,9 +188,15 @@ impl Workbench {
                     drawn.draw(view, &mapping, window, &self.depth, shift, None);
                     let (color, confidence) = (&drawn.color, &drawn.confidence);
                     let usable = |i: usize| good[i] && confidence[i] > 0.5;
-                    self.drawn_detail.measure(window, |i| color[i], usable, sigma, &mut self.scratch);
-                    let Some(step) = shift_between(&self.live_detail, &self.drawn_detail, usable, scene.scale) else { break };
-                    shift = [(shift[0] + step[0]).clamp(-limit, limit), (shift[1] + step[1]).clamp(-limit, limit)];
+                    self.drawn_detail
+                        .measure(window, |i| color[i], usable, sigma, &mut self.scratch);
+                    let Some(step) = shift_between(&self.live_detail, &self.drawn_detail, usable, scene.scale) else {
+                        break;
+                    };
+                    shift = [
+                        (shift[0] + step[0]).clamp(-limit, limit),
+                        (shift[1] + step[1]).clamp(-limit, limit),
+                    ];
                     // A step is right to about a tenth of its length.
                     if step[0].abs().max(step[1].abs()) < 0.4 {
                         break;

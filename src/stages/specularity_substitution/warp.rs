@@ -37,7 +37,15 @@ pub struct WarpedView {
 impl WarpedView {
     /// Draw `view` for every pixel of `window` that has a depth (`depth[i]` > 0), the live pixel moved by `shift` before it is looked up.
     /// Where `fine` says so the lookup is bicubic (Catmull–Rom), which keeps the tissue's texture; elsewhere bilinear.
-    pub fn draw(&mut self, view: &View, mapping: &Mapping, window: Window, depth: &[f32], shift: [f32; 2], fine: Option<&[bool]>) {
+    pub fn draw(
+        &mut self,
+        view: &View,
+        mapping: &Mapping,
+        window: Window,
+        depth: &[f32],
+        shift: [f32; 2],
+        fine: Option<&[bool]>,
+    ) {
         self.color.clear();
         self.color.resize(window.area(), [0.0; 3]);
         self.confidence.clear();
