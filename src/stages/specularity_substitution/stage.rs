@@ -175,19 +175,12 @@ impl SpecularitySubstitution {
 
     /// The frame's pixels, each from its region's result.
     fn put_together(&mut self, frame: &mut Frame, specular: &Mask) {
-        let (width, height) = specular.size();
         self.out.copy_from(&frame.image);
-        let mut code = self.codes.take_copy(specular);
-        for value in code.pixels_mut() {
-            *value = if *value != 0 {
-                provenance_code::LEFT
-            } else {
-                provenance_code::UNTOUCHED
-            };
-        }
-        let (mut view, mut confidence) = (self.views.take(width, height), self.codes.take(width, height));
-        view.fill(0);
-        confidence.fill(0);
+        let Provenance {
+            mut code,
+            mut view,
+            mut confidence,
+        } = self.all_left(specular);
         let (mut energy, mut shift, mut count) = (0.0_f32, 0.0_f32, 0.0_f32);
         for run in self.components.runs() {
             let filled = &self.regions[run.label as usize];
@@ -236,7 +229,8 @@ impl SpecularitySubstitution {
         frame.image.swap(&mut self.out);
     }
 
-    fn leave_all(&self, frame: &mut Frame, specular: &Mask) {
+    /// Every specularity left as it was.
+    fn all_left(&self, specular: &Mask) -> Provenance {
         let (width, height) = specular.size();
         let mut code = self.codes.take_copy(specular);
         for value in code.pixels_mut() {
@@ -249,7 +243,7 @@ impl SpecularitySubstitution {
         let (mut view, mut confidence) = (self.views.take(width, height), self.codes.take(width, height));
         view.fill(0);
         confidence.fill(0);
-        frame.provenance = Some(Provenance { code, view, confidence });
+        Provenance { code, view, confidence }
     }
 }
 
@@ -296,7 +290,7 @@ impl Stage for SpecularitySubstitution {
                 }
                 self.put_together(frame, &specular);
             }
-            _ => self.leave_all(frame, &specular),
+            _ => frame.provenance = Some(self.all_left(&specular)),
         }
         frame.specularities = Some(specular);
         Ok(())
