@@ -134,7 +134,7 @@ pub struct Config {
     /// The arm's pose corrected by the picture.
     pub pose_refinement: pose_refinement::Settings,
     /// How specularities are replaced.
-    pub substitution: specularity_substitution::stage::Settings,
+    pub substitution: specularity_substitution::settings::Settings,
     /// How the endoscope's image field is looked for.
     pub field_of_view: field_of_view::Settings,
 }

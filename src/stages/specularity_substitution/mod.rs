@@ -1,21 +1,26 @@
 //! What other views saw where this frame shows the lamp.
 //!
-//! Region by region of the specular mask:
+//! The frame is laid out in cells of about 8 px. For the cells around specularities:
 //!
-//! 1. [`candidates`]: which views looked at the same tissue, best by the unstructured-lumigraph penalties (Buehler et al. 2001) and
-//!    by how much of the hole they saw free of the lamp;
-//! 2. [`warp`]: each of them drawn as the live camera would see it, over the light field's surface;
-//! 3. [`ring`]: the small shift that is left, found on the ring of good pixels around the hole;
-//! 4. [`brightness`]: the lamp rides on the camera, so views differ in brightness from place to place; the ratio to the live picture
-//!    on the good pixels, carried into the hole by normalized convolution (Knutsson and Westin 1993);
-//! 5. [`region`]: the views blended, the ring's fit judged, and the picture replaced where it is *brighter* than what was measured:
-//!    the seam lies where both agree, so it cannot be seen.
+//! 1. [`camera_blending`]: which views looked at the same tissue, best by the unstructured-lumigraph penalties and by how much of
+//!    the hole they saw free of the lamp, chosen at the corners of blocks and blended in between (Buehler et al. 2001);
+//! 2. [`live`] and [`view_fit`]: each of these views, drawn small over the good pixels around the holes, gives its brightness against
+//!    the live picture (the lamp rides on the camera, so views differ from place to place), the small shift that is left, and how
+//!    well it then fits: three smooth fields by normalized convolution (Knutsson and Westin 1993);
+//! 3. [`blend`]: the views drawn in full over the holes, [`lookup`] by [`lookup`], and blended, the darker heard rather than the
+//!    brighter, since the lamp only adds light;
+//! 4. [`replacement`]: the picture replaced where it is *brighter* than what was measured: the seam lies where both agree, so it
+//!    cannot be seen.
 //!
-//! A region whose ring does not fit is left as it was, and says so.
+//! Where no view fits, the picture is left as it was, and says so.
 
-pub mod brightness;
-pub mod candidates;
-pub mod region;
-pub mod ring;
+pub mod blend;
+pub mod camera_blending;
+pub mod grid;
+pub mod live;
+pub mod lookup;
+pub mod replacement;
+pub mod scene;
+pub mod settings;
 pub mod stage;
-pub mod warp;
+pub mod view_fit;

@@ -1,0 +1,259 @@
+//! The chosen views drawn in full over the holes, and blended.
+
+use crossbeam::queue::ArrayQueue;
+use rayon::prelude::*;
+
+use crate::image::buffer::{Image, Rgb8};
+use crate::light_field::mapping::Mapping;
+use crate::stages::specularity_substitution::camera_blending::{CameraBlending, Corner};
+use crate::stages::specularity_substitution::live::{DARK_LEVELS, luminance};
+use crate::stages::specularity_substitution::lookup::{bicubic, is_unoccluded};
+use crate::stages::specularity_substitution::scene::Scene;
+use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
+
+/// At most so many views speak in a block, the loudest.
+const MAX_VOICES: usize = 8;
+/// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
+const BRIGHTER_HALF_LEVELS: f32 = 5.0;
+/// Rounds of that.
+const ROUNDS: usize = 2;
+
+/// What the light field shows over the holes of a frame; keeps its memory.
+#[derive(Debug)]
+pub struct Canvas {
+    /// Colours; only where `belief` is above zero.
+    pub color: Image<Rgb8>,
+    /// How sure, 0–255; 0 where nothing is known.
+    pub belief: Image<u8>,
+    /// The loudest view.
+    pub source: Image<u16>,
+    /// How much brighter the live picture is, levels.
+    pub excess: Image<f32>,
+    benches: ArrayQueue<Box<Bench>>,
+}
+
+impl Default for Canvas {
+    fn default() -> Self {
+        Self {
+            color: Image::filled(0, 0, [0; 3]),
+            belief: Image::filled(0, 0, 0),
+            source: Image::filled(0, 0, 0),
+            excess: Image::filled(0, 0, 0.0),
+            benches: ArrayQueue::new(64),
+        }
+    }
+}
+
+/// A pixel of a hole.
+#[derive(Clone, Copy, Debug)]
+struct Spot {
+    x: u16,
+    y: u16,
+    depth: f32,
+}
+
+/// A view's colour for a spot, and how loud.
+#[derive(Clone, Copy, Debug, Default)]
+struct Drawn {
+    color: [f32; 3],
+    weight: f32,
+    confidence: f32,
+}
+
+/// A view's loudness at the four corners of a block.
+#[derive(Clone, Copy, Debug)]
+struct Speaker {
+    slot: usize,
+    weights: [f32; 4],
+}
+
+/// Working memory of one block at a time.
+#[derive(Debug, Default)]
+struct Bench {
+    spots: Vec<Spot>,
+    speakers: Vec<Speaker>,
+    drawn: Vec<Drawn>,
+}
+
+/// What drawing needs besides the scene.
+#[derive(Clone, Copy, Debug)]
+pub struct Chosen<'a> {
+    /// Who speaks at every corner.
+    pub corners: &'a [Corner],
+    /// One fit for every view that speaks.
+    pub fits: &'a [ViewFit],
+    /// Per view, its place among `fits`.
+    pub slots: &'a [u16],
+    /// Per view, where it looks.
+    pub mappings: &'a [Option<Mapping>],
+}
+
+impl Canvas {
+    /// Draw and blend over all holes of the frame.
+    pub fn draw(&mut self, scene: &Scene<'_>, holes: &[u8], chosen: &Chosen<'_>) {
+        let (width, height) = scene.image.size();
+        self.color.resize(width, height, [0; 3]);
+        self.belief.resize(width, height, 0);
+        self.source.resize(width, height, 0);
+        self.excess.resize(width, height, 0.0);
+        let rows = scene.grid.block() * width;
+        let benches = &self.benches;
+        (self.color.pixels_mut().par_chunks_mut(rows))
+            .zip(self.belief.pixels_mut().par_chunks_mut(rows))
+            .zip(self.source.pixels_mut().par_chunks_mut(rows))
+            .zip(self.excess.pixels_mut().par_chunks_mut(rows))
+            .enumerate()
+            .for_each(|(j, (((color, belief), source), excess))| {
+                belief.fill(0);
+                excess.fill(0.0);
+                let mut bench = benches.pop().unwrap_or_default();
+                for i in 0..scene.grid.blocks().0 {
+                    bench.find_spots(scene, holes, i, j);
+                    if bench.spots.is_empty() {
+                        continue;
+                    }
+                    bench.find_speakers(scene, chosen, i, j);
+                    bench.draw(scene, chosen, i, j);
+                    for k in 0..bench.spots.len() {
+                        let spot = bench.spots[k];
+                        if let Some((blended, confidence, loudest)) = bench.blended(k) {
+                            let index = (usize::from(spot.y) - j * scene.grid.block()) * width + usize::from(spot.x);
+                            let live = scene.image.at(spot.x.into(), spot.y.into()).map(f32::from);
+                            color[index] = blended.map(|v| (v + 0.5) as u8);
+                            belief[index] = (255.0 * confidence).clamp(1.0, 255.0) as u8;
+                            source[index] = chosen.fits[bench.speakers[loudest].slot].view as u16;
+                            excess[index] = luminance(live) - luminance(blended);
+                        }
+                    }
+                }
+                // More benches than the queue holds are simply freed.
+                let _surplus = benches.push(bench);
+            });
+    }
+}
+
+impl Bench {
+    fn find_spots(&mut self, scene: &Scene<'_>, holes: &[u8], i: usize, j: usize) {
+        use crate::stages::specularity_substitution::grid::CELLS_PER_BLOCK;
+        self.spots.clear();
+        let grid = scene.grid;
+        for row in j * CELLS_PER_BLOCK..((j + 1) * CELLS_PER_BLOCK).min(grid.down) {
+            for column in i * CELLS_PER_BLOCK..((i + 1) * CELLS_PER_BLOCK).min(grid.across) {
+                if holes[row * grid.across + column] == 0 {
+                    continue;
+                }
+                for y in row * grid.cell..((row + 1) * grid.cell).min(grid.height) {
+                    for x in column * grid.cell..((column + 1) * grid.cell).min(grid.width) {
+                        if scene.is_open(x, y) {
+                            let depth = scene.depth_at(x, y);
+                            if depth > 0.0 {
+                                let (x, y) = (x as u16, y as u16);
+                                self.spots.push(Spot { x, y, depth });
+                            }
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    fn find_speakers(&mut self, scene: &Scene<'_>, chosen: &Chosen<'_>, i: usize, j: usize) {
+        self.speakers.clear();
+        let across = CameraBlending::corners_across(scene.grid);
+        for (index, corner) in [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)].into_iter().enumerate() {
+            for voice in chosen.corners[corner.1 * across + corner.0].voices() {
+                let slot = usize::from(chosen.slots[usize::from(voice.view)]);
+                let speaker = match self.speakers.iter().position(|s| s.slot == slot) {
+                    Some(place) => &mut self.speakers[place],
+                    None => {
+                        self.speakers.push(Speaker { slot, weights: [0.0; 4] });
+                        let last = self.speakers.len() - 1;
+                        &mut self.speakers[last]
+                    }
+                };
+                speaker.weights[index] = voice.weight;
+            }
+        }
+        let loudness = |s: &Speaker| s.weights.iter().sum::<f32>();
+        self.speakers
+            .sort_unstable_by(|a, b| loudness(b).total_cmp(&loudness(a)).then(a.slot.cmp(&b.slot)));
+        self.speakers.truncate(MAX_VOICES);
+    }
+
+    fn draw(&mut self, scene: &Scene<'_>, chosen: &Chosen<'_>, i: usize, j: usize) {
+        self.drawn.clear();
+        let block = scene.grid.block();
+        let (left, top, pitch) = ((i * block) as f32, (j * block) as f32, 1.0 / block as f32);
+        for speaker in &self.speakers {
+            let fit = &chosen.fits[speaker.slot];
+            let view = &scene.light_field.views[fit.view];
+            let Some(mapping) = &chosen.mappings[fit.view] else {
+                self.drawn.resize(self.drawn.len() + self.spots.len(), Drawn::default());
+                continue;
+            };
+            let (width, height) = view.image.size();
+            let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 2.0);
+            let confidences = view.confidence.pixels();
+            let depths = view.depth.pixels();
+            let [a, b, c, d] = speaker.weights;
+            self.drawn.extend(self.spots.iter().map(|spot| {
+                let (x, y) = (f32::from(spot.x), f32::from(spot.y));
+                let (fx, fy) = ((x - left) * pitch, (y - top) * pitch);
+                let loud = (a + (b - a) * fx) * (1.0 - fy) + (c + (d - c) * fx) * fy;
+                let field = scene.grid.between(&fit.field, x, y);
+                let (u, v, depth) = mapping.apply(x + field[part::SHIFT], y + field[part::SHIFT + 1], spot.depth);
+                let loud = loud * field[part::FIT];
+                if !(loud > 0.0 && depth > 0.0 && u >= 1.0 && v >= 1.0 && u < last_x && v < last_y) {
+                    return Drawn::default();
+                }
+                let (x0, y0) = (u as usize, v as usize);
+                let corner = y0 * width + x0;
+                // Where any of the four is dazzled the mixture is.
+                let near = [corner, corner + 1, corner + width, corner + width + 1];
+                let least = near.iter().fold(255, |least, &i| confidences[i].min(least));
+                if least == 0 || !is_unoccluded(depths[corner], depth) {
+                    return Drawn::default();
+                }
+                let color = bicubic(&view.image, x0, y0, u - x0 as f32, v - y0 as f32);
+                let confidence = f32::from(least) / 255.0;
+                Drawn {
+                    color: std::array::from_fn(|c| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS),
+                    // Clean sights outshout hazy ones by far more than the confidences alone.
+                    weight: loud * confidence * confidence,
+                    confidence,
+                }
+            }));
+        }
+    }
+
+    /// Colour, confidence and the loudest speaker for spot `k`; `None` when nobody saw it.
+    fn blended(&self, k: usize) -> Option<([f32; 3], f32, usize)> {
+        let count = self.spots.len();
+        let drawn = || (0..self.speakers.len()).map(|s| &self.drawn[s * count + k]);
+        let mut reference = f32::INFINITY;
+        let mut result = None;
+        for _ in 0..=ROUNDS {
+            let (mut sum, mut total, mut confidence) = ([0.0_f32; 3], 0.0_f32, 0.0_f32);
+            let mut loudest = (0.0_f32, 0);
+            for (index, view) in drawn().enumerate() {
+                let brighter = (luminance(view.color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
+                let weight = view.weight / (1.0 + brighter * brighter);
+                for (sum, channel) in sum.iter_mut().zip(view.color) {
+                    *sum += weight * channel;
+                }
+                total += weight;
+                confidence += weight * view.confidence;
+                if weight > loudest.0 {
+                    loudest = (weight, index);
+                }
+            }
+            if total < 1e-6 {
+                return None;
+            }
+            let color = sum.map(|s| (s / total).clamp(0.0, 255.0));
+            reference = luminance(color);
+            result = Some((color, confidence / total, loudest.1));
+        }
+        result
+    }
+}
