@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use crate::image::buffer::{Image, Rgb8};
 use crate::light_field::mapping::Mapping;
 use crate::stages::specularity_substitution::camera_blending::{CameraBlending, Corner};
+use crate::stages::specularity_substitution::grid::CELLS_PER_BLOCK;
 use crate::stages::specularity_substitution::live::{DARK_LEVELS, luminance};
 use crate::stages::specularity_substitution::lookup::{bicubic, is_unoccluded};
 use crate::stages::specularity_substitution::scene::Scene;
@@ -134,7 +135,6 @@ impl Canvas {
 
 impl Bench {
     fn find_spots(&mut self, scene: &Scene<'_>, holes: &[u8], i: usize, j: usize) {
-        use crate::stages::specularity_substitution::grid::CELLS_PER_BLOCK;
         self.spots.clear();
         let grid = scene.grid;
         for row in j * CELLS_PER_BLOCK..((j + 1) * CELLS_PER_BLOCK).min(grid.down) {

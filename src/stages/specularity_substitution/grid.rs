@@ -84,65 +84,119 @@ pub fn step_for(width: usize) -> usize {
     (width as f32 / SMALL_WIDTH_PX).round().max(1.0) as usize
 }
 
-/// Sums over the cells near and far, each a mean over about so many cells around.
+/// A rectangle of cells.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Span {
+    /// First column.
+    pub left: usize,
+    /// First row.
+    pub top: usize,
+    /// One past the last column.
+    pub right: usize,
+    /// One past the last row.
+    pub bottom: usize,
+}
+
+impl Span {
+    /// The smallest rectangle around this one and another; an empty one counts for nothing.
+    pub fn around(self, other: Self) -> Self {
+        if self.right <= self.left {
+            return other;
+        }
+        Self {
+            left: self.left.min(other.left),
+            top: self.top.min(other.top),
+            right: self.right.max(other.right),
+            bottom: self.bottom.max(other.bottom),
+        }
+    }
+
+    /// Rows of the rectangle.
+    pub fn rows(self) -> std::ops::Range<usize> {
+        self.top..self.bottom
+    }
+
+    /// The part of row `y` of a grid `across` cells wide that lies in the rectangle.
+    pub fn row(self, y: usize, across: usize) -> std::ops::Range<usize> {
+        y * across + self.left..y * across + self.right
+    }
+}
+
+/// Adds up cells over their surroundings; keeps its memory.
 #[derive(Debug, Default)]
 pub struct Smoother {
     rows: Vec<Sums>,
-    far: Vec<Sums>,
+    coarse: Vec<Sums>,
 }
 
-/// Two passes of a box this wide on each side: standard deviation 2 cells, about 15 px of a 960 px wide picture.
-const NEAR_RADIUS: usize = 2;
-/// The same for what counts where nothing is near.
-const FAR_RADIUS: usize = 8;
+/// Two passes of a box of this radius: standard deviation 2 cells, about 15 px of a 960 px wide picture.
+const RADIUS: usize = 2;
+/// The far mean is taken over cells this many times as long.
+const COARSER: usize = 4;
 /// Weight of the far mean against a cell full of good pixels.
 const FAR_WEIGHT: f32 = 0.02;
 
 impl Smoother {
-    /// Replace every cell by a weighted sum over its surroundings; what is near outweighs what is far where there is something near.
-    pub fn smooth(&mut self, grid: Grid, cells: &mut [Sums]) {
-        self.far.resize(cells.len(), [0.0; 8]);
+    /// Replace every cell of `span` by a weighted sum over its surroundings; what is near outweighs what is far where there is something
+    /// near. Cells out of `span` must be empty.
+    pub fn smooth(&mut self, grid: Grid, span: Span, cells: &mut [Sums]) {
+        let (across, down) = (grid.across.div_ceil(COARSER), grid.down.div_ceil(COARSER));
+        self.coarse.clear();
+        self.coarse.resize(across * down, [0.0; 8]);
+        for y in span.rows() {
+            for (x, cell) in (span.left..span.right).zip(&cells[span.row(y, grid.across)]) {
+                add(&mut self.coarse[y / COARSER * across + x / COARSER], cell, 1.0);
+            }
+        }
+        let all = Span {
+            left: 0,
+            top: 0,
+            right: across,
+            bottom: down,
+        };
         self.rows.resize(cells.len(), [0.0; 8]);
-        let (across, down) = (grid.across, grid.down);
         for _ in 0..2 {
-            box_sum(cells, across, down, NEAR_RADIUS, &mut self.rows);
+            box_mean(&mut self.coarse, across, all, &mut self.rows);
+            box_mean(cells, grid.across, span, &mut self.rows);
         }
-        self.far.copy_from_slice(cells);
-        for _ in 0..2 {
-            box_sum(&mut self.far, across, down, FAR_RADIUS, &mut self.rows);
-        }
-        for (near, far) in cells.iter_mut().zip(&self.far) {
-            for (near, far) in near.iter_mut().zip(far) {
-                *near += FAR_WEIGHT * far;
+        for y in span.rows() {
+            let (y0, y1, fy) = neighbours(y, down);
+            for (x, cell) in (span.left..span.right).zip(&mut cells[span.row(y, grid.across)]) {
+                let (x0, x1, fx) = neighbours(x, across);
+                let weight = FAR_WEIGHT / (COARSER * COARSER) as f32;
+                for (row, wy) in [(y0, 1.0 - fy), (y1, fy)] {
+                    add(cell, &self.coarse[row * across + x0], weight * wy * (1.0 - fx));
+                    add(cell, &self.coarse[row * across + x1], weight * wy * fx);
+                }
             }
         }
     }
 }
 
-/// The mean over a square, cells outside counting as empty.
-fn box_sum(cells: &mut [Sums], across: usize, down: usize, radius: usize, rows: &mut [Sums]) {
-    let share = 1.0 / (2 * radius + 1) as f32;
-    for (out, row) in rows.chunks_exact_mut(across).zip(cells.chunks_exact(across)) {
-        let mut sum = [0.0_f32; 8];
-        for cell in &row[..radius.min(across)] {
-            add(&mut sum, cell, 1.0);
-        }
-        for x in 0..across {
-            if x + radius < across {
-                add(&mut sum, &row[x + radius], 1.0);
+/// The two coarse cells whose middles lie around a fine cell's, and how near it is to the second.
+fn neighbours(fine: usize, count: usize) -> (usize, usize, f32) {
+    let place = ((fine as f32 + 0.5) / COARSER as f32 - 0.5).clamp(0.0, count as f32 - 1.0);
+    let first = place as usize;
+    (first, (first + 1).min(count - 1), place - first as f32)
+}
+
+/// The mean over a square of cells within `span`, cells outside counting as empty.
+fn box_mean(cells: &mut [Sums], across: usize, span: Span, rows: &mut [Sums]) {
+    let share = 1.0 / (2 * RADIUS + 1) as f32;
+    for y in span.rows() {
+        let source = &cells[span.row(y, across)];
+        for (x, out) in rows[span.row(y, across)].iter_mut().enumerate() {
+            *out = [0.0; 8];
+            for cell in &source[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(source.len())] {
+                add(out, cell, share);
             }
-            if x > radius {
-                add(&mut sum, &row[x - radius - 1], -1.0);
-            }
-            out[x] = sum.map(|s| s * share);
         }
     }
-    cells.fill([0.0; 8]);
-    for y in 0..down {
-        let (begin, end) = (y.saturating_sub(radius), (y + radius + 1).min(down));
-        let out = &mut cells[y * across..(y + 1) * across];
-        for v in begin..end {
-            for (out, cell) in out.iter_mut().zip(&rows[v * across..(v + 1) * across]) {
+    for y in span.rows() {
+        let out = &mut cells[span.row(y, across)];
+        out.fill([0.0; 8]);
+        for v in y.saturating_sub(RADIUS).max(span.top)..(y + RADIUS + 1).min(span.bottom) {
+            for (out, cell) in out.iter_mut().zip(&rows[span.row(v, across)]) {
                 add(out, cell, share);
             }
         }
@@ -180,7 +234,13 @@ mod tests {
                 cells[y * grid.across + x] = [2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
             }
         }
-        Smoother::default().smooth(grid, &mut cells);
+        let all = Span {
+            left: 0,
+            top: 0,
+            right: grid.across,
+            bottom: grid.down,
+        };
+        Smoother::default().smooth(grid, all, &mut cells);
         for (x, y) in [(21, 21), (26, 22), (34, 24)] {
             let cell = cells[y * grid.across + x];
             assert!(cell[0] > 0.0 && (cell[1] / cell[0] - 1.5).abs() < 1e-3, "{x} {y} {cell:?}");

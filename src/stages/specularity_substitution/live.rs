@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_CELL, Smoother, Sums};
+use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_CELL, Smoother, Span, Sums};
 use crate::stages::specularity_substitution::scene::Scene;
 
 /// Added to levels before they are compared as ratios: in the dark ratios are noise.
@@ -61,6 +61,12 @@ impl Live {
         // First the mean, then the deviation from it.
         self.means.clear();
         self.means.resize(grid.count(), [0.0; 8]);
+        let all = Span {
+            left: 0,
+            top: 0,
+            right: grid.across,
+            bottom: grid.down,
+        };
         for deviation in [false, true] {
             self.detail.clear();
             for cell in 0..grid.count() {
@@ -80,7 +86,7 @@ impl Live {
                 }
                 self.detail.push(sums);
             }
-            self.smoother.smooth(grid, &mut self.detail);
+            self.smoother.smooth(grid, all, &mut self.detail);
             std::mem::swap(&mut self.means, &mut self.detail);
         }
         std::mem::swap(&mut self.means, &mut self.detail);

@@ -7,7 +7,7 @@
 use crate::image::buffer::Image;
 use crate::light_field::mapping::Mapping;
 use crate::light_field::view::View;
-use crate::stages::specularity_substitution::grid::{SMALL_PER_CELL, Smoother, Sums, step_for};
+use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, SMALL_PER_CELL, Smoother, Span, Sums, step_for};
 use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live, luminance};
 use crate::stages::specularity_substitution::lookup::{bilinear_with_confidence, is_unoccluded};
 use crate::stages::specularity_substitution::scene::Scene;
@@ -48,6 +48,7 @@ pub struct ViewFit {
     /// Per cell: see [`part`].
     pub field: Vec<Sums>,
     context: Vec<u8>,
+    span: Span,
     brightness: Vec<f32>,
     sums: Vec<Sums>,
     equations: Vec<Sums>,
@@ -84,18 +85,23 @@ impl ViewFit {
         self.view = view;
         self.context.clear();
         self.context.resize(cells, 0);
+        self.span = Span::default();
     }
 
     /// The view is needed in the blocks that meet at corner (i, j).
     pub fn need_around(&mut self, scene: &Scene<'_>, i: usize, j: usize) {
-        use crate::stages::specularity_substitution::grid::CELLS_PER_BLOCK;
         let reach = CELLS_PER_BLOCK + CONTEXT_CELLS;
         let grid = scene.grid;
-        for row in (j * CELLS_PER_BLOCK).saturating_sub(reach)..(j * CELLS_PER_BLOCK + reach).min(grid.down) {
-            let begin = (i * CELLS_PER_BLOCK).saturating_sub(reach);
-            let end = (i * CELLS_PER_BLOCK + reach).min(grid.across);
-            self.context[row * grid.across + begin..row * grid.across + end].fill(1);
+        let span = Span {
+            left: (i * CELLS_PER_BLOCK).saturating_sub(reach),
+            top: (j * CELLS_PER_BLOCK).saturating_sub(reach),
+            right: (i * CELLS_PER_BLOCK + reach).min(grid.across),
+            bottom: (j * CELLS_PER_BLOCK + reach).min(grid.down),
+        };
+        for row in span.rows() {
+            self.context[span.row(row, grid.across)].fill(1);
         }
+        self.span = self.span.around(span);
     }
 
     /// Find the fields. `small` is the view's [`small_copy`].
@@ -106,10 +112,10 @@ impl ViewFit {
         let rounds = if settings.align_on_ring { settings.ring_rounds.max(1) } else { 1 };
         for round in 0..rounds {
             self.draw(scene, live, small, mapping, round > 0);
-            self.smoother.smooth(scene.grid, &mut self.sums);
+            self.smoother.smooth(scene.grid, self.span, &mut self.sums);
             self.match_brightness();
             self.compare(scene, live);
-            self.smoother.smooth(scene.grid, &mut self.equations);
+            self.smoother.smooth(scene.grid, self.span, &mut self.equations);
             self.judge(live, settings);
             if !settings.align_on_ring {
                 break;
