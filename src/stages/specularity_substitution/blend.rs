@@ -13,7 +13,7 @@ use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
 
 /// At most so many views speak in a block, the loudest.
-const MAX_VOICES: usize = 8;
+const MAX_VOICES: usize = 16;
 /// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
 const BRIGHTER_HALF_LEVELS: f32 = 5.0;
 /// Rounds of that.

@@ -14,7 +14,7 @@ use crate::stages::specularity_substitution::lookup::is_unoccluded;
 use crate::stages::specularity_substitution::scene::Scene;
 
 /// At most so many views speak at a corner.
-pub const MAX_VIEWS: usize = 6;
+pub const MAX_VIEWS: usize = 8;
 
 /// So many views are enough once every place was seen.
 const ENOUGH_VIEWS: usize = 4;
@@ -26,7 +26,7 @@ const WANTED_SIGHTINGS: usize = 3;
 const SIGHTING_WORTH: f32 = 0.6;
 
 /// The first sighting of a place is worth more than the second, and that more than the third.
-const WORTH_OF_NEXT: [f32; WANTED_SIGHTINGS] = [1.0, 0.25, 0.1];
+const WORTH_OF_NEXT: [f32; WANTED_SIGHTINGS] = [1.0, 0.15, 0.05];
 
 /// What a hazy sight of a place is worth that no chosen view sees clean.
 const WORTH_OF_A_GLIMPSE: f32 = 0.3;
@@ -67,14 +67,17 @@ impl Corner {
     }
 }
 
-/// A pixel of a hole, standing for its cell.
+/// A pixel of a hole, standing for a quarter of its cell.
 #[derive(Clone, Copy, Debug, Default)]
 struct Place {
     x: f32,
     y: f32,
-    /// mm; 0 where the cell has no hole.
+    /// mm; 0 where the quarter has no hole.
     depth: f32,
 }
+
+/// Places of a cell: what a view sees clean between two lobes may be no wider than half a cell.
+const PLACES_PER_CELL: usize = 4;
 
 /// How a view sees a place.
 const UNSEEN: u8 = 0;
@@ -118,7 +121,7 @@ impl CameraBlending {
             .enumerate()
             .for_each(|(j, row)| {
                 for (i, penalties) in row.chunks_mut(views.max(1)).enumerate() {
-                    let Some(place) = support(scene.grid, i, j).map(|c| places[c]).find(|p| p.depth > 0.0) else {
+                    let Some(place) = places_around(scene.grid, i, j).map(|p| places[p]).find(|p| p.depth > 0.0) else {
                         continue;
                     };
                     let point = world_point(scene, place);
@@ -138,39 +141,22 @@ impl CameraBlending {
         }
     }
 
-    /// A pixel for every cell with a hole: the specular one nearest to the cell's middle, else the one nearest to the mask.
+    /// A pixel for every quarter of a cell with a hole: the specular one nearest to the quarter's middle, else the one nearest to the mask.
     fn find_places(&mut self, scene: &Scene<'_>) {
         let grid = scene.grid;
         self.places.clear();
-        self.places.resize(grid.count(), Place::default());
-        self.places.par_chunks_mut(grid.across).enumerate().for_each(|(row, places)| {
-            for (column, place) in places.iter_mut().enumerate() {
-                let (left, top) = (column * grid.cell, row * grid.cell);
-                let middle = grid.cell / 2;
-                let mut best = u32::MAX;
-                for y in top..(top + grid.cell).min(grid.height) {
-                    let columns = left..(left + grid.cell).min(grid.width);
-                    for (x, &distance) in columns.clone().zip(&scene.distance.row(y)[columns]) {
-                        if distance > scene.reach || scene.forbidden.at(x, y) != 0 {
-                            continue;
-                        }
-                        let off_centre = (x - left).abs_diff(middle).max((y - top).abs_diff(middle));
-                        let cost = u32::from(distance) * 64 + off_centre as u32;
-                        if cost < best {
-                            let depth = scene.depth_at(x, y);
-                            if depth > 0.0 {
-                                best = cost;
-                                *place = Place {
-                                    x: x as f32,
-                                    y: y as f32,
-                                    depth,
-                                };
-                            }
-                        }
-                    }
+        self.places.resize(grid.count() * PLACES_PER_CELL, Place::default());
+        self.places
+            .par_chunks_mut(grid.across * PLACES_PER_CELL)
+            .enumerate()
+            .for_each(|(row, places)| {
+                for (index, place) in places.iter_mut().enumerate() {
+                    let half = grid.cell / 2;
+                    let (column, quarter) = (index / PLACES_PER_CELL, index % PLACES_PER_CELL);
+                    let (left, top) = (column * grid.cell + quarter % 2 * half, row * grid.cell + quarter / 2 * half);
+                    *place = place_in(scene, left, top, half);
                 }
-            }
-        });
+            });
     }
 
     /// How every view sees every place.
@@ -193,32 +179,36 @@ impl CameraBlending {
 
     fn choose_at(&self, grid: Grid, i: usize, j: usize, views: usize) -> Corner {
         let mut corner = Corner::default();
-        let cells: Cells = gather(grid, i, j, &self.places);
-        if cells.count == 0 {
+        let holes = gather(grid, i, j, &self.places);
+        if holes.count == 0 {
             return corner;
         }
-        let cells = &cells.index[..cells.count];
+        let places = &holes.index[..holes.count];
         let across = Self::corners_across(grid);
         let neighbours = [
             (i > 0).then(|| &self.corners[j * across + i - 1]),
             (j > 0).then(|| &self.corners[(j - 1) * across + i]),
         ];
         let penalties = &self.penalties[(j * across + i) * views..][..views];
-        let bits = |view: usize, least: u8| -> u32 {
-            let seen = |(bit, &cell): (usize, &usize)| u32::from(self.sights[cell * views + view] >= least) << bit;
-            cells.iter().enumerate().map(seen).sum()
+        let bits = |view: usize, least: u8| -> u64 {
+            let seen = |(bit, &place): (usize, &usize)| u64::from(self.sights[place * views + view] >= least) << bit;
+            places.iter().enumerate().map(seen).sum()
         };
-        let all = (1_u32 << cells.len()) - 1;
+        let all = u64::MAX >> (u64::BITS as usize - places.len());
+        let could_be_seen = (penalties.iter().enumerate())
+            .filter(|(_, penalty)| penalty.is_finite())
+            .fold(0, |seen, (view, _)| seen | bits(view, CLEAN));
         // Places seen so often, and places that were glimpsed twice.
         let mut wanted = [all, 0, 0];
-        let (mut glimpsed, mut glimpsed_twice) = (0_u32, 0_u32);
+        let (mut glimpsed, mut glimpsed_twice) = (0_u64, 0_u64);
         while corner.count < MAX_VIEWS {
             let unseen = wanted[0] & !glimpsed_twice;
+            let still_to_be_seen = wanted[0] & could_be_seen != 0 || unseen != 0;
             let total: f32 = wanted.iter().zip(WORTH_OF_NEXT).map(|(w, worth)| worth * w.count_ones() as f32).sum();
-            if total == 0.0 || unseen == 0 && corner.count >= ENOUGH_VIEWS {
+            if total == 0.0 || !still_to_be_seen && corner.count >= ENOUGH_VIEWS {
                 break;
             }
-            let mut best: Option<(f32, u16, u32, u32)> = None;
+            let mut best: Option<(f32, u16, u64, u64)> = None;
             for (view, &penalty) in penalties.iter().enumerate() {
                 if !penalty.is_finite() || corner.speaks(view as u16) {
                     continue;
@@ -264,22 +254,50 @@ impl CameraBlending {
     }
 }
 
-/// Cells of a corner's support that have a hole.
-struct Cells {
-    index: [usize; 4 * SUPPORT * SUPPORT],
+/// The pixel that stands for a square.
+fn place_in(scene: &Scene<'_>, left: usize, top: usize, side: usize) -> Place {
+    let (mut best, mut place) = (u32::MAX, Place::default());
+    for y in top..(top + side).min(scene.grid.height) {
+        let columns = left..(left + side).min(scene.grid.width);
+        if columns.is_empty() {
+            break;
+        }
+        for (x, &distance) in columns.clone().zip(&scene.distance.row(y)[columns]) {
+            if distance > scene.reach || scene.forbidden.at(x, y) != 0 {
+                continue;
+            }
+            let off_centre = (x - left).abs_diff(side / 2).max((y - top).abs_diff(side / 2));
+            let cost = u32::from(distance) * 64 + off_centre as u32;
+            let depth = scene.depth_at(x, y);
+            if cost < best && depth > 0.0 {
+                best = cost;
+                place = Place {
+                    x: x as f32,
+                    y: y as f32,
+                    depth,
+                };
+            }
+        }
+    }
+    place
+}
+
+/// Places of a corner's support that have a hole.
+struct Holes {
+    index: [usize; 4 * SUPPORT * SUPPORT * PLACES_PER_CELL],
     count: usize,
 }
 
-fn gather(grid: Grid, i: usize, j: usize, places: &[Place]) -> Cells {
-    let mut cells = Cells {
-        index: [0; 4 * SUPPORT * SUPPORT],
+fn gather(grid: Grid, i: usize, j: usize, places: &[Place]) -> Holes {
+    let mut holes = Holes {
+        index: [0; 4 * SUPPORT * SUPPORT * PLACES_PER_CELL],
         count: 0,
     };
-    for cell in support(grid, i, j).filter(|&c| places[c].depth > 0.0) {
-        cells.index[cells.count] = cell;
-        cells.count += 1;
+    for place in places_around(grid, i, j).filter(|&p| places[p].depth > 0.0) {
+        holes.index[holes.count] = place;
+        holes.count += 1;
     }
-    cells
+    holes
 }
 
 /// The cells of the blocks that meet at corner (i, j).
@@ -287,6 +305,10 @@ pub fn support(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
     let columns = (i * CELLS_PER_BLOCK).saturating_sub(SUPPORT)..(i * CELLS_PER_BLOCK + SUPPORT).min(grid.across);
     let rows = (j * CELLS_PER_BLOCK).saturating_sub(SUPPORT)..(j * CELLS_PER_BLOCK + SUPPORT).min(grid.down);
     rows.flat_map(move |row| columns.clone().map(move |column| row * grid.across + column))
+}
+
+fn places_around(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
+    support(grid, i, j).flat_map(|cell| cell * PLACES_PER_CELL..(cell + 1) * PLACES_PER_CELL)
 }
 
 fn world_point(scene: &Scene<'_>, place: Place) -> Vector3<f64> {
