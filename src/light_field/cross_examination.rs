@@ -1,111 +1,191 @@
 //! Which pixels of a view show the lamp, told by the other views.
 //!
 //! One picture's detector must draw its line around a highlight generously, and what it silences is missed later: the lamp's image moves
-//! so little between neighbouring views that their generous lines overlap. But the views have one brightness (gains, lamp model) to about
-//! a hundredth, and a specularity only ever adds white light (Shafer 1985): the darkest answers that agree with each other show the
-//! tissue; a doubtful pixel that is no brighter, or no whiter, shows tissue too and may speak; one that is brighter and whiter shows the
-//! lamp.
+//! so little between neighbouring views that their generous lines overlap; and the haze beyond that line is too faint for one picture.
+//! But the views have one brightness (gains, lamp model) to about a hundredth, and a specularity only ever adds white light (Shafer
+//! 1985): the darkest answers that agree with each other show the tissue; what a pixel has more than that, and in white, is the lamp's.
+//!
+//! Haze is smooth, so all this is done for every second pixel of every second row.
 
 use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Mask};
+use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 use crate::image::hole_filling::HoleFiller;
+use crate::light_field::lamp_share::{Tissue, difference};
 use crate::light_field::mapping::Mapping;
 use crate::light_field::view::{LampShading, LightField, View};
 
+/// Pixels along a square that is judged as one.
+const STEP: usize = 2;
+/// Pixels within this distance of a doubtful one are judged too, px of a 960 px wide picture.
+const HAZE_REACH_PX: f32 = 20.0;
 /// Fewer answers settle nothing.
 const FEWEST_ANSWERS: usize = 4;
-/// So many answers, and this share of all, must agree to be the tissue's: most of the witnesses may be dazzled themselves.
-const FEWEST_AGREEING: usize = 3;
-/// See [`FEWEST_AGREEING`].
-const AGREEING_SHARE: f32 = 0.08;
-/// At least so many of the darkest answers are looked at.
-const DARKEST: usize = 12;
-/// Answers agree when they differ by at most this share.
-const AGREEMENT: f32 = 0.05;
-/// White light of up to this share of the brightness may be noise of the colours.
-const WHITE_NOISE: f32 = 0.015;
-/// Below this ratio of colour to brightness the tissue is too white to tell the lamp's light by its colour.
-const LEAST_COLOR: f32 = 0.15;
-/// A pixel this much brighter begins to lose confidence, share of its brightness.
-const BRIGHTER_FROM: f32 = 0.035;
-/// A pixel this much brighter has only `HAZY` confidence left: it speaks where nobody else does.
-const HAZE: f32 = 0.07;
+/// Up to this share of white light may be noise.
+const CLEAN_TO: f32 = 0.02;
+/// A pixel with this share of white light speaks where nobody else does, with `HAZY` confidence.
+const HAZE: f32 = 0.06;
 /// Confidence in a pixel under haze.
 const HAZY: f32 = 0.12;
-/// A pixel this much brighter shows the lamp as well as tissue.
-const BRIGHTER_TO: f32 = 0.13;
+/// A pixel with this share shows the lamp as well as tissue.
+const DAZZLED_FROM: f32 = 0.13;
 /// Its confidence then: heard only where every view is dazzled, the least dazzled loudest.
 const DAZZLED: f32 = 0.035;
-/// A pixel this much brighter shows the lamp only.
+/// A pixel with this share shows the lamp only.
 const LAMP_ONLY: f32 = 0.6;
-/// A pixel this much darker shows something else: steel, a shadow, the surround.
-const DARKER: f32 = 0.12;
+/// A pixel this much darker than the lamp explains shows something else: steel, a shadow, the surround.
+const DARKER: f32 = 0.15;
+/// Below this share noise is averaged away; above it edges are kept.
+const FAINT: f32 = 0.08;
 /// Added to both sides, levels: in the dark ratios are noise.
 const DARK_LEVELS: f32 = 8.0;
 /// Views disagree in depth by at most this share.
 const OCCLUSION_TOLERANCE: f32 = 0.03;
 /// Depth is carried into holes over about 2 to this power, px.
 const DEPTH_REACH_LEVELS: usize = 6;
+/// Exposure and lamp are smooth: held for squares of this many pixels along a side.
+const SHADE_PITCH: usize = 8;
 
-/// Settle every view's doubtful pixels (confidence below 255); their depth maps, gains and the lamp model must stand.
+/// Settle every view's doubtful pixels (confidence below 255) and those near them; depth maps, gains and the lamp model must stand.
 pub fn refine_confidence(light_field: &mut LightField) {
     let field = &*light_field;
+    let shades: Vec<Shade> = field.views.par_iter().map(|view| Shade::new(view, &field.shading)).collect();
     let settled: Vec<Mask> = (0..field.views.len())
         .into_par_iter()
-        .map_init(HoleFiller::default, |filler, index| examined(field, index, filler))
+        .map_init(HoleFiller::default, |filler, index| examined(field, &shades, index, filler))
         .collect();
     for (view, confidence) in light_field.views.iter_mut().zip(settled) {
         view.confidence = confidence;
     }
 }
 
-fn examined(light_field: &LightField, index: usize, filler: &mut HoleFiller) -> Mask {
+/// Steel, a shadow, the surround.
+const SOMETHING_ELSE: f32 = f32::INFINITY;
+/// Nothing is known of this square.
+const UNKNOWN: f32 = f32::NAN;
+
+fn examined(light_field: &LightField, shades: &[Shade], index: usize, filler: &mut HoleFiller) -> Mask {
     let view = &light_field.views[index];
+    let (width, height) = view.image.size();
     let mut depth = view.depth.clone();
     filler.fill(&mut depth, DEPTH_REACH_LEVELS);
-    let witnesses: Vec<Witness<'_>> = (light_field.views.iter().enumerate())
+    let near = near_doubt(&view.confidence);
+    let witnesses: Vec<Witness<'_>> = (light_field.views.iter().zip(shades).enumerate())
         .filter(|&(other, _)| other != index)
-        .filter_map(|(_, other)| Witness::new(view, other))
+        .filter_map(|(_, (other, shade))| Witness::new(view, other, shade))
         .collect();
-    let mut confidence = view.confidence.clone();
-    let mut answers = Vec::with_capacity(witnesses.len() + 1);
-    let shading = &light_field.shading;
-    for y in 0..view.image.height() {
-        for x in 0..view.image.width() {
+    let (across, down) = (width / STEP, height / STEP);
+    let mut shares = Image::filled(across, down, UNKNOWN);
+    let mut tissue = Tissue::default();
+    for row in 0..down {
+        for column in 0..across {
+            let (x, y) = (column * STEP, row * STEP);
             let z = depth.at(x, y);
-            if view.confidence.at(x, y) == 255 || z <= 0.0 {
+            if near.at(x, y) == 0 || z <= 0.0 {
                 continue;
             }
-            let own = common_color(view, shading, view.image.at(x, y), x as f32, y as f32, z);
-            answers.clear();
-            answers.extend(witnesses.iter().filter_map(|w| w.color(shading, x as f32, y as f32, z)));
-            if answers.len() < FEWEST_ANSWERS {
+            tissue.clear();
+            let middle = 0.5 * (STEP as f32 - 1.0);
+            let place = (x as f32 + middle, y as f32 + middle);
+            for witness in &witnesses {
+                if let Some(answer) = witness.color(place.0, place.1, z) {
+                    tissue.hear(answer);
+                }
+            }
+            if tissue.answers() < FEWEST_ANSWERS {
                 continue;
             }
+            let own = shades[index].common(mean_color(view, x, y), x, y);
             // The pixel is a witness too: with two that agree it need not be outvoted by a dazzled crowd.
-            answers.push(own);
-            let tissue = darkest_agreeing(&mut answers);
-            let trust = trust_in(lamp_share(own, tissue));
-            let [r, g, b] = view.image.at(x, y);
+            tissue.hear(own);
+            let found = difference(own, tissue.color());
+            shares.set(column, row, if found.lit < -DARKER { SOMETHING_ELSE } else { found.lamp });
+        }
+    }
+    let smooth = averaged(&shares);
+    let mut confidence = view.confidence.clone();
+    for y in 0..down * STEP {
+        for x in 0..across * STEP {
+            let share = smooth.at(x / STEP, y / STEP);
+            if share.is_nan() {
+                continue;
+            }
             // A clipped pixel tells nothing whatever the others say.
-            let clipped = r.min(g).min(b) >= 250;
-            confidence.set(x, y, if clipped { 0 } else { (254.0 * trust) as u8 });
+            let clipped = view.image.at(x, y).iter().all(|&c| c >= 250);
+            let settled = if clipped { 0 } else { (254.0 * trust_in(share)) as u8 };
+            // What no detector doubted and is darker than expected is no lamp: an edge, seen from elsewhere.
+            if view.confidence.at(x, y) < 255 || share > CLEAN_TO && share != SOMETHING_ELSE {
+                confidence.set(x, y, settled);
+            }
         }
     }
     despeckled(&confidence, &view.confidence)
 }
 
-/// Confidence in a pixel by how much brighter it is than the witnesses say, as a share.
-fn trust_in(ratio: f32) -> f32 {
-    if ratio < -DARKER || ratio >= LAMP_ONLY {
+/// 255 on doubtful pixels and near them.
+fn near_doubt(confidence: &Mask) -> Mask {
+    let (width, height) = confidence.size();
+    let mut doubt = confidence.clone();
+    for value in doubt.pixels_mut() {
+        *value = if *value < 255 { 255 } else { 0 };
+    }
+    let reach = (HAZE_REACH_PX * width as f32 / 960.0 * f32::from(UNITS_PER_PX)) as u16;
+    let mut distance = Image::filled(width, height, 0);
+    chamfer_distance(&doubt, reach + 1, &mut distance);
+    for (value, &distance) in doubt.pixels_mut().iter_mut().zip(distance.pixels()) {
+        *value = if distance <= reach { 255 } else { 0 };
+    }
+    doubt
+}
+
+fn mean_color(view: &View, x: usize, y: usize) -> [f32; 3] {
+    let mut sum = [0.0; 3];
+    for v in y..y + STEP {
+        for pixel in &view.image.row(v)[x..x + STEP] {
+            for (sum, &channel) in sum.iter_mut().zip(pixel) {
+                *sum += f32::from(channel);
+            }
+        }
+    }
+    sum.map(|s| s / (STEP * STEP) as f32)
+}
+
+/// Faint shares averaged over 3 × 3 squares; strong ones as they are.
+fn averaged(shares: &Image<f32>) -> Image<f32> {
+    let (width, height) = shares.size();
+    let mut out = shares.clone();
+    for y in 0..height {
+        for x in 0..width {
+            let share = shares.at(x, y);
+            if share.is_nan() || share > FAINT {
+                continue;
+            }
+            let (mut sum, mut count) = (0.0, 0.0);
+            for v in y.saturating_sub(1)..(y + 2).min(height) {
+                for &s in &shares.row(v)[x.saturating_sub(1)..(x + 2).min(width)] {
+                    if s.is_finite() {
+                        sum += s.clamp(-FAINT, 2.0 * FAINT);
+                        count += 1.0;
+                    }
+                }
+            }
+            out.set(x, y, sum / count);
+        }
+    }
+    out
+}
+
+/// Confidence in a pixel by its share of white light.
+fn trust_in(share: f32) -> f32 {
+    if share >= LAMP_ONLY {
         0.0
-    } else if ratio >= BRIGHTER_TO {
-        DAZZLED * ((LAMP_ONLY - ratio) / (LAMP_ONLY - BRIGHTER_TO)).powi(2)
-    } else if ratio <= HAZE {
-        1.0 - (1.0 - HAZY) * ((ratio - BRIGHTER_FROM) / (HAZE - BRIGHTER_FROM)).clamp(0.0, 1.0)
+    } else if share >= DAZZLED_FROM {
+        DAZZLED * ((LAMP_ONLY - share) / (LAMP_ONLY - DAZZLED_FROM)).powi(2)
+    } else if share <= HAZE {
+        1.0 - (1.0 - HAZY) * ((share - CLEAN_TO) / (HAZE - CLEAN_TO)).clamp(0.0, 1.0)
     } else {
-        DAZZLED + (HAZY - DAZZLED) * (BRIGHTER_TO - ratio) / (BRIGHTER_TO - HAZE)
+        DAZZLED + (HAZY - DAZZLED) * (DAZZLED_FROM - share) / (DAZZLED_FROM - HAZE)
     }
 }
 
@@ -116,7 +196,7 @@ fn despeckled(settled: &Mask, before: &Mask) -> Mask {
     for y in 0..height {
         for x in 0..width {
             let value = if before.at(x, y) == 255 {
-                255
+                settled.at(x, y)
             } else {
                 let mut least = 255;
                 for v in y.saturating_sub(1)..(y + 2).min(height) {
@@ -131,107 +211,92 @@ fn despeckled(settled: &Mask, before: &Mask) -> Mask {
     out
 }
 
+/// What undoes a view's exposure and lamp, square by square.
+struct Shade {
+    factors: Image<f32>,
+    gain: [f32; 3],
+}
+
+impl Shade {
+    fn new(view: &View, shading: &LampShading) -> Self {
+        let (width, height) = view.image.size();
+        let mut factors = Image::filled(width.div_ceil(SHADE_PITCH), height.div_ceil(SHADE_PITCH), 1.0);
+        let k = &view.camera.intrinsics;
+        if !shading.is_flat() {
+            let mut depth = view.depth.clone();
+            HoleFiller::default().fill(&mut depth, DEPTH_REACH_LEVELS);
+            for row in 0..factors.height() {
+                for column in 0..factors.width() {
+                    let x = (column * SHADE_PITCH + SHADE_PITCH / 2).min(width - 1);
+                    let y = (row * SHADE_PITCH + SHADE_PITCH / 2).min(height - 1);
+                    let (u, v) = ((x as f64 - k.cx) / k.fx, (y as f64 - k.cy) / k.fy);
+                    let rho2 = (u * u + v * v) as f32;
+                    let z = depth.at(x, y);
+                    if z > 0.0 {
+                        factors.set(column, row, (-shading.log_brightness(z * (1.0 + rho2).sqrt(), rho2)).exp());
+                    }
+                }
+            }
+        }
+        Self {
+            factors,
+            gain: view.gain,
+        }
+    }
+
+    /// Colour with the view's exposure and lamp undone.
+    fn common(&self, color: [f32; 3], x: usize, y: usize) -> [f32; 3] {
+        let factor = self.factors.at(x / SHADE_PITCH, y / SHADE_PITCH);
+        std::array::from_fn(|c| (color[c] * self.gain[c] + DARK_LEVELS) * factor)
+    }
+}
+
 struct Witness<'a> {
     view: &'a View,
+    shade: &'a Shade,
     mapping: Mapping,
 }
 
 impl<'a> Witness<'a> {
-    fn new(asking: &View, view: &'a View) -> Option<Self> {
-        Mapping::new(&asking.camera, &asking.world_from_camera, view).map(|mapping| Self { view, mapping })
+    fn new(asking: &View, view: &'a View, shade: &'a Shade) -> Option<Self> {
+        Mapping::new(&asking.camera, &asking.world_from_camera, view).map(|mapping| Self { view, shade, mapping })
     }
 
     /// The common colour of what this view shows where (x, y) at depth z lies; `None` if it does not see that.
-    fn color(&self, shading: &LampShading, x: f32, y: f32, z: f32) -> Option<[f32; 3]> {
+    fn color(&self, x: f32, y: f32, z: f32) -> Option<[f32; 3]> {
         let (u, v, depth) = self.mapping.apply(x, y, z);
         let (width, height) = self.view.image.size();
-        if !(u >= 0.0 && v >= 0.0 && u <= width as f32 - 1.0 && v <= height as f32 - 1.0) {
+        if !(u >= 0.0 && v >= 0.0 && u < width as f32 - 1.0 && v < height as f32 - 1.0) {
             return None;
         }
         let (column, row) = ((u + 0.5) as usize, (v + 0.5) as usize);
-        let held = self.view.depth.at(column.min(width - 1), row.min(height - 1));
+        let held = self.view.depth.at(column, row);
         if held > 0.0 && (held - depth).abs() > OCCLUSION_TOLERANCE * depth {
             return None;
         }
-        let color = self.view.image.at(column.min(width - 1), row.min(height - 1));
-        Some(common_color(self.view, shading, color, u, v, depth))
+        Some(self.shade.common(self.view.image.at(column, row).map(f32::from), column, row))
     }
-}
-
-/// The mean of the darkest answers that agree with each other.
-fn darkest_agreeing(answers: &mut Vec<[f32; 3]>) -> [f32; 3] {
-    let enough = FEWEST_AGREEING.max((AGREEING_SHARE * answers.len() as f32) as usize);
-    let darker = |a: &[f32; 3], b: &[f32; 3]| luma(*a).total_cmp(&luma(*b));
-    let looked_at = DARKEST.max(answers.len() / 4);
-    if answers.len() > looked_at {
-        answers.select_nth_unstable_by(looked_at, darker);
-        answers.truncate(looked_at);
-    }
-    answers.sort_unstable_by(darker);
-    let mean = |group: &[[f32; 3]]| -> [f32; 3] { std::array::from_fn(|c| group.iter().map(|a| a[c]).sum::<f32>() / group.len() as f32) };
-    (answers.windows(enough))
-        .find(|group| luma(group[enough - 1]) <= (1.0 + AGREEMENT) * luma(group[0]))
-        .map_or_else(|| answers[answers.len() / 2], mean)
-}
-
-/// Light that `color` has and `tissue` has not, as a share of the tissue's brightness; negative when it is darker. Only white light counts,
-/// where the tissue has a colour: what is brighter in the tissue's own colour is lit better.
-fn lamp_share(color: [f32; 3], tissue: [f32; 3]) -> f32 {
-    let brightness = luma(tissue).max(1.0);
-    let brighter = (luma(color) - luma(tissue)) / brightness;
-    let mean = tissue.iter().sum::<f32>() / 3.0;
-    let colorful = tissue.map(|t| t - mean);
-    let square: f32 = colorful.iter().map(|c| c * c).sum();
-    if square < (LEAST_COLOR * mean).powi(2) {
-        return brighter;
-    }
-    // color = a·tissue + s·white, least squares: a from the part of both that is not white.
-    let a = color.iter().zip(colorful).map(|(c, k)| c * k).sum::<f32>() / square;
-    let white = (color.iter().sum::<f32>() / 3.0 - a * mean) / brightness;
-    if white < -WHITE_NOISE {
-        // More colourful than what was taken for the tissue: the others show more of the lamp than this one.
-        return brighter.clamp(-DARKER, 0.0);
-    }
-    brighter.min(white.max(0.0) + WHITE_NOISE)
-}
-
-fn luma([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
-}
-
-/// Colour with the view's exposure and lamp undone.
-fn common_color(view: &View, shading: &LampShading, color: [u8; 3], x: f32, y: f32, z: f32) -> [f32; 3] {
-    let k = &view.camera.intrinsics;
-    let (u, v) = ((x - k.cx as f32) / k.fx as f32, (y - k.cy as f32) / k.fy as f32);
-    let rho2 = u * u + v * v;
-    let lamp = if shading.is_flat() {
-        0.0
-    } else {
-        shading.log_brightness(z * (1.0 + rho2).sqrt(), rho2)
-    };
-    let factor = (-lamp).exp();
-    std::array::from_fn(|c| (f32::from(color[c]) * view.gain[c] + DARK_LEVELS) * factor)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const TISSUE: [f32; 3] = [170.0, 80.0, 70.0];
-
     #[test]
-    fn a_few_clean_answers_outvote_a_dazzled_crowd() {
-        let mut answers: Vec<[f32; 3]> = (0..20).map(|i| TISSUE.map(|c| c + 12.0 + 8.0 * i as f32)).collect();
-        answers.extend([TISSUE, TISSUE.map(|c| c * 1.01), TISSUE.map(|c| c * 1.02)]);
-        assert!((luma(darkest_agreeing(&mut answers)) / luma(TISSUE) - 1.01).abs() < 0.01);
+    fn trust_falls_with_the_share_of_white_light() {
+        let trust: Vec<f32> = [0.0, 0.02, 0.04, 0.06, 0.1, 0.2, 0.5, 0.7].map(trust_in).to_vec();
+        assert!(trust.windows(2).all(|w| w[0] >= w[1]), "{trust:?}");
+        assert!(trust[1] == 1.0 && trust[4] > 0.0 && trust[5] > 0.0 && trust[7] == 0.0);
+        assert_eq!((trust_in(-0.2), trust_in(SOMETHING_ELSE)), (1.0, 0.0));
     }
 
     #[test]
-    fn only_white_light_is_the_lamps() {
-        assert!(lamp_share(TISSUE.map(|c| c + 20.0), TISSUE) > 0.15);
-        assert!(lamp_share(TISSUE.map(|c| c * 1.2), TISSUE) < 0.02);
-        assert!(lamp_share(TISSUE.map(|c| c * 0.8), TISSUE) < -0.15);
-        // White tissue: brightness alone decides.
-        assert!(lamp_share([215.0; 3], [195.0; 3]) > 0.09);
+    fn faint_shares_are_averaged_and_strong_ones_kept() {
+        let mut shares = Image::filled(5, 5, 0.0);
+        shares.set(2, 2, 0.045);
+        shares.set(4, 4, 0.3);
+        shares.set(0, 4, UNKNOWN);
+        let smooth = averaged(&shares);
+        assert!((smooth.at(2, 2) - 0.005).abs() < 1e-6 && smooth.at(4, 4) == 0.3 && smooth.at(0, 4).is_nan());
     }
 }

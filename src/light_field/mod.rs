@@ -8,6 +8,7 @@ pub mod depth;
 pub mod error;
 pub mod evaluate;
 pub mod file;
+pub mod lamp_share;
 pub mod mapping;
 pub mod photometry;
 pub mod ply;

@@ -35,7 +35,7 @@ const WORTH_OF_A_GLIMPSE: f32 = 0.3;
 const WORTH_OF_COMPANY: f32 = 0.03;
 
 /// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
-const HEARD_FROM: u8 = 60;
+const HEARD_FROM: u8 = 120;
 
 /// Cells around a corner that its views should see.
 const SUPPORT: usize = CELLS_PER_BLOCK;
