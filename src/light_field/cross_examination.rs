@@ -23,9 +23,9 @@ const HAZE_REACH_PX: f32 = 20.0;
 /// Fewer answers settle nothing.
 const FEWEST_ANSWERS: usize = 4;
 /// Up to this share of white light may be noise.
-const CLEAN_TO: f32 = 0.02;
+const CLEAN_TO: f32 = 0.015;
 /// A pixel with this share of white light speaks where nobody else does, with `HAZY` confidence.
-const HAZE: f32 = 0.06;
+const HAZE: f32 = 0.05;
 /// Confidence in a pixel under haze.
 const HAZY: f32 = 0.12;
 /// A pixel with this share shows the lamp as well as tissue.
@@ -33,7 +33,7 @@ const DAZZLED_FROM: f32 = 0.13;
 /// Its confidence then: heard only where every view is dazzled, the least dazzled loudest.
 const DAZZLED: f32 = 0.035;
 /// A pixel with this share shows the lamp only.
-const LAMP_ONLY: f32 = 0.6;
+const LAMP_ONLY: f32 = 1.5;
 /// A pixel this much darker than the lamp explains shows something else: steel, a shadow, the surround.
 const DARKER: f32 = 0.15;
 /// Below this share noise is averaged away; above it edges are kept.
@@ -113,7 +113,7 @@ fn examined(light_field: &LightField, shades: &[Shade], index: usize, filler: &m
             }
             // A clipped pixel tells nothing whatever the others say.
             let clipped = view.image.at(x, y).iter().all(|&c| c >= 250);
-            let settled = if clipped { 0 } else { (254.0 * trust_in(share)) as u8 };
+            let settled = if clipped { 0 } else { (254.0 * trust_in(share)).ceil() as u8 };
             // What no detector doubted and is darker than expected is no lamp: an edge, seen from elsewhere.
             if view.confidence.at(x, y) < 255 || share > CLEAN_TO && share != SOMETHING_ELSE {
                 confidence.set(x, y, settled);
@@ -181,7 +181,7 @@ fn trust_in(share: f32) -> f32 {
     if share >= LAMP_ONLY {
         0.0
     } else if share >= DAZZLED_FROM {
-        DAZZLED * ((LAMP_ONLY - share) / (LAMP_ONLY - DAZZLED_FROM)).powi(2)
+        DAZZLED * ((LAMP_ONLY - share) / (LAMP_ONLY - DAZZLED_FROM)).powi(6)
     } else if share <= HAZE {
         1.0 - (1.0 - HAZY) * ((share - CLEAN_TO) / (HAZE - CLEAN_TO)).clamp(0.0, 1.0)
     } else {
@@ -284,7 +284,7 @@ mod tests {
 
     #[test]
     fn trust_falls_with_the_share_of_white_light() {
-        let trust: Vec<f32> = [0.0, 0.02, 0.04, 0.06, 0.1, 0.2, 0.5, 0.7].map(trust_in).to_vec();
+        let trust: Vec<f32> = [0.0, 0.01, 0.04, 0.06, 0.1, 0.2, 0.5, 1.7].map(trust_in).to_vec();
         assert!(trust.windows(2).all(|w| w[0] >= w[1]), "{trust:?}");
         assert!(trust[1] == 1.0 && trust[4] > 0.0 && trust[5] > 0.0 && trust[7] == 0.0);
         assert_eq!((trust_in(-0.2), trust_in(SOMETHING_ELSE)), (1.0, 0.0));

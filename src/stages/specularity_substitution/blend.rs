@@ -247,7 +247,7 @@ impl Bench {
                     loudest = (weight, index);
                 }
             }
-            if total < 1e-6 {
+            if total < 1e-12 {
                 return None;
             }
             let color = sum.map(|s| (s / total).clamp(0.0, 255.0));
