@@ -67,28 +67,40 @@ impl Kernel for BothWays<'_> {
             scratch,
         } = self;
         let (width, height) = image.size();
+        let BlurScratch { strip, blurred } = scratch;
+        let (strip, blurred) = (&mut strip[..width.max(height)], &mut blurred[..width.max(height)]);
         for rows in image.pixels_mut().chunks_mut(LANES * width) {
-            let strip = &mut scratch.strip[..width];
-            for (lane, row) in rows.chunks_exact(width).enumerate() {
-                for (place, value) in strip.iter_mut().zip(row) {
-                    place[lane] = *value;
+            for left in (0..width).step_by(LANES) {
+                for (lane, row) in rows.chunks_exact(width).enumerate().take(LANES) {
+                    match row[left..].first_chunk::<LANES>() {
+                        Some(values) => (0..LANES).for_each(|i| strip[left + i][lane] = values[i]),
+                        None => (left..width).for_each(|x| strip[x][lane] = row[x]),
+                    }
                 }
             }
-            boxes(strip, &mut scratch.blurred[..width], radius, passes);
-            for (lane, row) in rows.chunks_exact_mut(width).enumerate() {
-                for (place, value) in scratch.blurred[..width].iter().zip(row) {
-                    *value = place[lane];
+            boxes(&mut strip[..width], &mut blurred[..width], radius, passes);
+            for left in (0..width).step_by(LANES) {
+                for (lane, row) in rows.chunks_exact_mut(width).enumerate().take(LANES) {
+                    match row[left..].first_chunk_mut::<LANES>() {
+                        Some(values) => (0..LANES).for_each(|i| values[i] = blurred[left + i][lane]),
+                        None => (left..width).for_each(|x| row[x] = blurred[x][lane]),
+                    }
                 }
             }
         }
         for left in (0..width).step_by(LANES) {
-            let right = (left + LANES).min(width);
-            for (place, row) in scratch.strip.iter_mut().zip(image.pixels().chunks_exact(width)) {
-                place[..right - left].copy_from_slice(&row[left..right]);
+            for (place, row) in strip.iter_mut().zip(image.pixels().chunks_exact(width)) {
+                match row[left..].first_chunk::<LANES>() {
+                    Some(values) => *place = *values,
+                    None => place[..width - left].copy_from_slice(&row[left..]),
+                }
             }
-            boxes(&mut scratch.strip[..height], &mut scratch.blurred[..height], radius, passes);
-            for (place, row) in scratch.blurred.iter().zip(image.pixels_mut().chunks_exact_mut(width)) {
-                row[left..right].copy_from_slice(&place[..right - left]);
+            boxes(&mut strip[..height], &mut blurred[..height], radius, passes);
+            for (place, row) in blurred.iter().zip(image.pixels_mut().chunks_exact_mut(width)) {
+                match row[left..].first_chunk_mut::<LANES>() {
+                    Some(values) => *values = *place,
+                    None => row[left..].copy_from_slice(&place[..width - left]),
+                }
             }
         }
     }
@@ -131,13 +143,16 @@ fn box_mean(source: &[Lanes], out: &mut [Lanes], radius: usize) {
     }
     if inner_begin < inner_end {
         let entering = &source[inner_begin + radius..];
+        // A copy that nothing points to can stay in registers.
+        let mut running = sum;
         for ((out, entering), leaving) in out[inner_begin..inner_end].iter_mut().zip(entering).zip(source) {
             for lane in 0..LANES {
                 // The difference first: the sum then waits for one addition a step, not for two.
-                sum[lane] += entering[lane] - leaving[lane];
-                out[lane] = sum[lane] * whole;
+                running[lane] += entering[lane] - leaving[lane];
+                out[lane] = running[lane] * whole;
             }
         }
+        sum = running;
     }
     for at in ends.skip_while(|at| *at < inner_begin) {
         end(at, &mut sum, out);

@@ -1,16 +1,17 @@
-//! Every pixel held against bounds that are interpolated between the centres of cells.
+//! Every pixel held against bounds that are interpolated between the centres of cells: along each row of cells once, then down to each
+//! row of pixels.
 
 use rayon::prelude::*;
 
-use crate::image::buffer::{Image, Mask};
+use crate::image::buffer::Mask;
 use crate::image::specularity::background::Bounds;
-use crate::image::specularity::cells::{Extremes, LANES};
+use crate::image::specularity::cells::Extremes;
 use crate::image::wide::{self, Kernel};
 
 /// In the darkest channel, clipped.
 const CLIPPED_LEVEL: f32 = 250.0;
-/// Pixels on the stack at a time: one stretch between centres is written through here, and what it writes too much is written over.
-const STRETCH: usize = 512;
+/// Pixels judged at a time.
+const CHUNK: usize = 64;
 
 /// What decides about a pixel beside its color.
 #[derive(Debug)]
@@ -25,152 +26,159 @@ pub(super) struct Rules<'a> {
     pub step: usize,
     /// See [`Settings::whiteness`](crate::image::specularity::Settings::whiteness).
     pub whiteness: f32,
-    /// Filled by [`place_between_centres`].
-    pub between: &'a [f32],
 }
 
-/// For each pixel right of a cell's centre, how far it is on the way to the next; longer than a cell, as a stretch at the border may be.
-pub(super) fn place_between_centres(step: usize, out: &mut Vec<f32>) {
-    let first = (step / 2) as f32 + 0.5 - 0.5 * step as f32;
-    out.clear();
-    out.extend((0..2 * step + LANES).map(|column| (column as f32 + first) / step as f32));
+/// Holds pixels against bounds; owns its working memory.
+#[derive(Debug, Default)]
+pub(super) struct Classifier {
+    /// For each pixel right of a cell's centre, how far it is on the way to the next.
+    between: Vec<f32>,
+    /// Per row of cells the bounds at every pixel column: core, halo, white.
+    along: Vec<[Vec<f32>; 3]>,
 }
 
-/// 255 in `cores` and in `halos` where a pixel exceeds their bounds.
-pub(super) fn classify(extremes: &Extremes, rules: &Rules<'_>, cores: &mut Mask, halos: &mut Mask) {
-    let width = cores.width();
-    let steel_rows = rules.steel.height();
-    let rows = cores
-        .pixels_mut()
-        .par_chunks_mut(width)
-        .zip(halos.pixels_mut().par_chunks_mut(width));
-    rows.enumerate().for_each(|(y, (cores, halos))| {
-        let at = y * width;
-        wide::run(PixelRow {
-            least: &extremes.least[at..at + width + LANES],
-            most: &extremes.most[at..at + width + LANES],
-            y,
-            rules,
-            cores,
-            halos,
-        });
-        let steel = rules.steel.row((y / rules.step).min(steel_rows - 1));
-        if steel.iter().any(|&s| s != 0) {
+impl Classifier {
+    /// 255 in `cores` and in `halos` where a pixel exceeds their bounds.
+    pub fn classify(&mut self, extremes: &Extremes, rules: &Rules<'_>, cores: &mut Mask, halos: &mut Mask) {
+        let width = cores.width();
+        self.spread(rules, width);
+        let (cells_down, step) = (self.along.len(), rules.step);
+        let along = &self.along;
+        let rows = cores
+            .pixels_mut()
+            .par_chunks_mut(width)
+            .zip(halos.pixels_mut().par_chunks_mut(width));
+        rows.enumerate().for_each(|(y, (cores, halos))| {
+            let place = ((y as f32 + 0.5) / step as f32 - 0.5).clamp(0.0, cells_down as f32 - 1.0);
+            let top = place as usize;
+            let pixels = y * width..(y + 1) * width;
+            wide::run(PixelRow {
+                least: &extremes.least[pixels.clone()],
+                most: &extremes.most[pixels],
+                top: &along[top],
+                bottom: &along[(top + 1).min(cells_down - 1)],
+                part: place.fract(),
+                whiteness: rules.whiteness,
+                cores,
+                halos,
+            });
+            let steel = rules.steel.row((y / step).min(cells_down - 1));
             for (cell, _) in steel.iter().enumerate().filter(|(_, s)| **s != 0) {
-                let end = if cell + 1 == steel.len() {
-                    width
-                } else {
-                    (cell + 1) * rules.step
-                };
-                cores[cell * rules.step..end].fill(0);
-                halos[cell * rules.step..end].fill(0);
+                let end = if cell + 1 == steel.len() { width } else { (cell + 1) * step };
+                cores[cell * step..end].fill(0);
+                halos[cell * step..end].fill(0);
             }
-        }
-        if let Some(field) = rules.field {
-            for ((core, halo), inside) in cores.iter_mut().zip(halos.iter_mut()).zip(field.row(y)) {
-                let outside = *inside == 0;
-                *core = if outside { 0 } else { *core };
-                *halo = if outside { 0 } else { *halo };
+            if let Some(field) = rules.field {
+                for ((core, halo), inside) in cores.iter_mut().zip(halos.iter_mut()).zip(field.row(y)) {
+                    let outside = *inside == 0;
+                    *core = if outside { 0 } else { *core };
+                    *halo = if outside { 0 } else { *halo };
+                }
             }
-        }
-    });
+        });
+    }
+
+    /// Interpolate the bounds along the rows of cells.
+    fn spread(&mut self, rules: &Rules<'_>, width: usize) {
+        let (step, cells_down) = (rules.step, rules.steel.height());
+        let first = (step / 2) as f32 + 0.5 - 0.5 * step as f32;
+        self.between.clear();
+        self.between
+            .extend((0..step).map(|column| (column as f32 + first) / step as f32));
+        self.along.resize_with(cells_down, <[Vec<f32>; 3]>::default);
+        let between = &self.between;
+        let bounds = [&rules.bounds.core, &rules.bounds.halo, &rules.bounds.white];
+        self.along.par_iter_mut().enumerate().for_each(|(row, along)| {
+            for (out, bound) in along.iter_mut().zip(bounds) {
+                out.resize(width, 0.0);
+                let cells = bound.row(row);
+                let (half, last) = (step / 2, cells.len() - 1);
+                out[..half].fill(cells[0]);
+                let stretches = out[half..half + last * step].chunks_exact_mut(step);
+                for (stretch, ends) in stretches.zip(cells.windows(2)) {
+                    let slope = ends[1] - ends[0];
+                    for (out, t) in stretch.iter_mut().zip(between) {
+                        *out = ends[0] + slope * t;
+                    }
+                }
+                out[half + last * step..].fill(cells[last]);
+            }
+        });
+    }
 }
 
 struct PixelRow<'a> {
-    /// With [`LANES`] more.
     least: &'a [u8],
     most: &'a [u8],
-    y: usize,
-    rules: &'a Rules<'a>,
+    /// Bounds along the rows of cells above and below.
+    top: &'a [Vec<f32>; 3],
+    bottom: &'a [Vec<f32>; 3],
+    /// How far from the one to the other.
+    part: f32,
+    whiteness: f32,
     cores: &'a mut [u8],
     halos: &'a mut [u8],
 }
 
-/// Bounds along a row between two centres: the first centre's, and the difference to the second.
-#[derive(Clone, Copy)]
-struct Slopes {
-    core: (f32, f32),
-    halo: (f32, f32),
-    white: (f32, f32),
-}
-
 impl Kernel for PixelRow<'_> {
     #[inline(always)]
-    fn run(self) {
-        let Rules {
-            bounds,
-            step,
-            whiteness,
-            between,
-            ..
-        } = *self.rules;
-        let (across, down) = bounds.core.size();
-        let place = ((self.y as f32 + 0.5) / step as f32 - 0.5).clamp(0.0, down as f32 - 1.0);
-        let (top, part) = (place as usize, place.fract());
-        let bottom = (top + 1).min(down - 1);
-        let along = |bound: &Image<f32>, a: usize, b: usize| {
-            let (top, bottom) = (bound.row(top), bound.row(bottom));
-            let (a, b) = (top[a] + (bottom[a] - top[a]) * part, top[b] + (bottom[b] - top[b]) * part);
-            (a, b - a)
-        };
-        let width = self.cores.len();
-        let mut begin = 0;
-        // Between the centres of two cells all bounds are linear.
-        for right in 0..=across {
-            let end = if right == across {
-                width
-            } else {
-                (right * step + step / 2).min(width)
-            };
-            let (a, b) = (right.max(1) - 1, right.min(across - 1));
-            let slopes = Slopes {
-                core: along(&bounds.core, a, b),
-                halo: along(&bounds.halo, a, b),
-                white: along(&bounds.white, a, b),
-            };
-            let n = end.saturating_sub(begin);
-            let (mut cores, mut halos) = ([0; STRETCH], [0; STRETCH]);
-            for lane in (0..n).step_by(LANES) {
-                let at = begin + lane;
-                let lanes = (self.least[at..].first_chunk(), self.most[at..].first_chunk());
-                let lanes = (lanes.0, lanes.1, between[lane..].first_chunk());
-                if let (Some(least), Some(most), Some(between)) = lanes {
-                    let found = judge(least, most, between, &slopes, whiteness);
-                    cores[lane..lane + LANES].copy_from_slice(&found.0);
-                    halos[lane..lane + LANES].copy_from_slice(&found.1);
-                }
-            }
-            self.cores[begin..begin + n].copy_from_slice(&cores[..n]);
-            self.halos[begin..begin + n].copy_from_slice(&halos[..n]);
-            begin = end.max(begin);
+    fn run(mut self) {
+        let n = self.cores.len();
+        if n < CHUNK {
+            (0..n).for_each(|at| self.judge::<1>(at));
+            return;
         }
+        for at in (0..n - CHUNK).step_by(CHUNK) {
+            self.judge::<CHUNK>(at);
+        }
+        // The last chunk may judge some pixels again.
+        self.judge::<CHUNK>(n - CHUNK);
     }
 }
 
-/// Everything in 32 bits until the end: in mixed widths the compiler would not stay in vector registers.
-#[inline(always)]
-fn judge(
-    least: &[u8; LANES],
-    most: &[u8; LANES],
-    between: &[f32; LANES],
-    slopes: &Slopes,
-    whiteness: f32,
-) -> ([u8; LANES], [u8; LANES]) {
-    let (mut cores, mut halos) = ([0_u32; LANES], [0_u32; LANES]);
-    for i in 0..LANES {
-        let (value, brightest, t) = (f32::from(least[i]), f32::from(most[i]), between[i]);
-        let bound = |(start, slope): (f32, f32)| start + slope * t;
-        let white = value - whiteness * brightest >= bound(slopes.white);
-        let clipped = value >= CLIPPED_LEVEL;
-        cores[i] = u32::from(clipped | (white & (value > bound(slopes.core)))) * 255;
-        halos[i] = u32::from(clipped | (white & (value > bound(slopes.halo)))) * 255;
+impl PixelRow<'_> {
+    /// `N` pixels, a number known to the compiler. In floats, and without a decision before the end: in mixed widths it would not stay
+    /// in vector registers.
+    #[inline(always)]
+    fn judge<const N: usize>(&mut self, at: usize) {
+        let (part, whiteness) = (self.part, self.whiteness);
+        let bounds = |k: usize| {
+            Some((
+                self.top[k].get(at..)?.first_chunk::<N>()?,
+                self.bottom[k].get(at..)?.first_chunk::<N>()?,
+            ))
+        };
+        let levels = (self.least[at..].first_chunk::<N>(), self.most[at..].first_chunk::<N>());
+        let out = (
+            self.cores[at..].first_chunk_mut::<N>(),
+            self.halos[at..].first_chunk_mut::<N>(),
+        );
+        let (Some(core), Some(halo), Some(white)) = (bounds(0), bounds(1), bounds(2)) else {
+            return;
+        };
+        let ((Some(least), Some(most)), (Some(cores), Some(halos))) = (levels, out) else {
+            return;
+        };
+        let lower = |a: f32, b: f32| if a < b { a } else { b };
+        let higher = |a: f32, b: f32| if a > b { a } else { b };
+        // 255 for all above zero: the sign spread over the number, where a comparison would be taken apart lane by lane.
+        let met = |by: f32| (((0.0 - by).to_bits() as i32) >> 31) as u8;
+        for i in 0..N {
+            let bound = |(top, bottom): (&[f32; N], &[f32; N])| top[i] + (bottom[i] - top[i]) * part;
+            let (value, brightest) = (f32::from(least[i]), f32::from(most[i]));
+            // By how much each demand is met.
+            let white = value - whiteness * brightest - bound(white);
+            let clipped = value - (CLIPPED_LEVEL - 0.5);
+            cores[i] = met(higher(clipped, lower(white, value - bound(core))));
+            halos[i] = met(higher(clipped, lower(white, value - bound(halo))));
+        }
     }
-    (cores.map(|v| v as u8), halos.map(|v| v as u8))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::image::buffer::Image;
     use rand::{RngExt as _, SeedableRng as _};
 
     /// One pixel, the plainest way; `t` is found anew for every pixel.
@@ -199,7 +207,7 @@ mod tests {
         for (width, height, step) in [(70, 44, 8), (67, 31, 5), (23, 19, 1), (100, 90, 16), (61, 50, 20)] {
             let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(step as u64);
             let mut plane = || {
-                (0..width * height + LANES)
+                (0..width * height)
                     .map(|_| random.random_range(60..=255))
                     .collect::<Vec<u8>>()
             };
@@ -225,18 +233,15 @@ mod tests {
             steel.set(cells.0 - 1, 1, 255);
             let mut field = Image::filled(width, height, 255);
             field.set(3, 3, 0);
-            let mut between = Vec::new();
-            place_between_centres(step, &mut between);
             let rules = Rules {
                 bounds: &bounds,
                 steel: &steel,
                 field: Some(&field),
                 step,
                 whiteness: 0.72,
-                between: &between,
             };
             let (mut cores, mut halos) = (Image::filled(width, height, 7), Image::filled(width, height, 7));
-            classify(&extremes, &rules, &mut cores, &mut halos);
+            Classifier::default().classify(&extremes, &rules, &mut cores, &mut halos);
             let mut differing = 0;
             for y in 0..height {
                 for x in 0..width {

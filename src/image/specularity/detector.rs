@@ -6,7 +6,7 @@ use crate::image::components::Components;
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 use crate::image::specularity::background::Background;
 use crate::image::specularity::cells::{CHUNK, Cells, Extremes};
-use crate::image::specularity::classify::{self, Rules};
+use crate::image::specularity::classify::{Classifier, Rules};
 use crate::image::specularity::settings::{CELLS_ACROSS, REFERENCE_WIDTH_PX, Settings};
 use crate::image::specularity::steel::Steel;
 
@@ -25,7 +25,7 @@ pub struct SpecularityDetector {
     extremes: Extremes,
     steel: Steel,
     background: Background,
-    between: Vec<f32>,
+    classifier: Classifier,
     cores: Mask,
     halos: Mask,
     distance: Image<u16>,
@@ -44,7 +44,7 @@ impl SpecularityDetector {
             extremes: Extremes::default(),
             steel: Steel::new(),
             background: Background::new(),
-            between: Vec::new(),
+            classifier: Classifier::default(),
             cores: Image::filled(0, 0, 0),
             halos: Image::filled(0, 0, 0),
             distance: Image::filled(0, 0, 0),
@@ -73,16 +73,15 @@ impl SpecularityDetector {
         self.steel.find(&self.settings, &self.cells, brightness, &mut self.scratch);
         self.background
             .find(&self.settings, &self.cells, &self.steel.mask, brightness, &mut self.scratch);
-        classify::place_between_centres(step, &mut self.between);
         let rules = Rules {
             bounds: &self.background.bounds,
             steel: &self.steel.mask,
             field,
             step,
             whiteness: self.settings.whiteness,
-            between: &self.between,
         };
-        classify::classify(&self.extremes, &rules, &mut self.cores, &mut self.halos);
+        self.classifier
+            .classify(&self.extremes, &rules, &mut self.cores, &mut self.halos);
         self.join_halos_to_cores(specular);
         enlarge(&self.steel.mask, step, instruments);
     }
