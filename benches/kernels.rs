@@ -9,7 +9,7 @@ use endofield::image::distance::{UNITS_PER_PX, chamfer_distance};
 use endofield::image::remap::Interpolation;
 use endofield::image::specularity::{self, SpecularityDetector};
 use endofield::image::wide;
-use endofield::localization::detail::DetailPyramid;
+use endofield::localization::detail::{DetailPyramid, Usable};
 use endofield::localization::image_alignment::{self, ImageAligner};
 use endofield::stages::color_normalization::affine::{Affine, AffineRun};
 use endofield::stages::temporal_median::guard::Guard;
@@ -113,7 +113,10 @@ fn localization(operation: &Operation, specular: &Mask, add: &mut dyn FnMut(&str
     let picture: &Image<Rgb8> = &view.image;
     let mut scratch = BlurScratch::default();
     let mut pyramid = DetailPyramid::default();
-    let usable = |x: usize, y: usize| specular.at(x, y) == 0;
+    let usable = Usable {
+        without: [Some(specular), None],
+        ..Usable::default()
+    };
     add("detail pyramid", &mut || pyramid.build(picture, &usable, &mut scratch));
     let mut aligner = ImageAligner::new(&operation.light_field, &image_alignment::Settings::default());
     let away = Transform::<Camera, Camera>::new(nalgebra::UnitQuaternion::identity(), Vector3::new(0.4, -0.3, 0.2));
