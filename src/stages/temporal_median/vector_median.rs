@@ -44,9 +44,9 @@ where
     #[inline(always)]
     fn run(self) {
         match (self.method, self.distance) {
-            (Method::Marginal, _) => self.with(|colors| colors.marginal_median()),
-            (Method::Vector, Distance::L1) => self.with(|colors| colors.vector_median(l1)),
-            (Method::Vector, Distance::L2) => self.with(|colors| colors.vector_median(l2)),
+            (Method::Marginal, _) => self.by::<Marginal>(),
+            (Method::Vector, Distance::L1) => self.by::<VectorL1>(),
+            (Method::Vector, Distance::L2) => self.by::<VectorL2>(),
         }
     }
 }
@@ -56,7 +56,7 @@ where
     [Wide; N]: Colors<N>,
 {
     #[inline(always)]
-    fn with(self, choose: impl Fn([Wide; N]) -> Wide) {
+    fn by<M: Median>(self) {
         let Self {
             window,
             start,
@@ -89,7 +89,7 @@ where
             let [red, green, blue, far] = &mut results;
             for i in 0..CHUNK {
                 let pixel = <[Wide; N]>::gather(&colors, i);
-                let [r, g, b] = choose(pixel);
+                let [r, g, b] = M::of(pixel);
                 let [now_r, now_g, now_b] = pixel[0];
                 let apart = |a: i16, b: i16| a.wrapping_sub(b).wrapping_abs();
                 let apart = apart(r, now_r).max(apart(g, now_g)).max(apart(b, now_b));
@@ -125,6 +125,48 @@ fn widened(levels: &[u8; CHUNK]) -> [i16; CHUNK] {
         wide[i] = i16::from(levels[i]);
     }
     wide
+}
+
+/// One of the medians. A closure would do, but cannot be forced inline: where the compiler leaves it outside, the loop is scalar and
+/// ten times slower.
+trait Median {
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>;
+}
+
+struct Marginal;
+struct VectorL1;
+struct VectorL2;
+
+impl Median for Marginal {
+    #[inline(always)]
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>,
+    {
+        colors.marginal_median()
+    }
+}
+
+impl Median for VectorL1 {
+    #[inline(always)]
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>,
+    {
+        colors.vector_median(l1)
+    }
+}
+
+impl Median for VectorL2 {
+    #[inline(always)]
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>,
+    {
+        colors.vector_median(l2)
+    }
 }
 
 #[inline(always)]
