@@ -1,7 +1,13 @@
 //! How fast the whole line is on this machine: 1080p frames of a simulated operation through every stage.
 //!
-//! Prints ms per stage, frames per second and memory. `cargo bench --bench pipeline [-- FRAMES]`, 150 frames unless told.
-//! Decoding and encoding are not in it; `endofield process --report` measures them too.
+//! `cargo bench --bench pipeline [-- [FRAMES] [--front] [--json FILE]]`, 200 frames unless told, fewer
+//! where they would take longer than a quarter of a minute. Three tables:
+//!
+//! 1. each stage alone on one core: processor time a frame, which does not depend on what else the machine does;
+//! 2. the line as it runs, one thread a stage over rayon's pool: wall time a frame and stage, and frames per second;
+//! 3. the pixel kernels, each alone on one core.
+//!
+//! `--front` leaves the substitution out. Decoding and encoding are not in it; `endofield process --report` measures them too.
 #![expect(
     clippy::print_stdout,
     clippy::print_stderr,
@@ -11,66 +17,37 @@
 
 use std::sync::Arc;
 
-use endofield::camera::intrinsics::Pixel;
-use endofield::camera::model::CameraModel;
-use endofield::compose::{self, Choice, Equipment};
+use endofield::compose::{self, Choice, Equipment, Line};
 use endofield::config::Config;
-use endofield::frame::{Frame, FrameId};
-use endofield::geometry::mesh::Mesh;
-use endofield::geometry::point::Point;
-use endofield::geometry::space::{Camera, Hand, RobotBase, World};
-use endofield::geometry::transform::Transform;
-use endofield::image::buffer::{Image, Rgb8};
-use endofield::image::pool::Pool;
-use endofield::light_field::view::{LightField, View};
+use endofield::frame::Frame;
 use endofield::pipeline::builder::Pipeline;
+use endofield::pipeline::outcome::Outcome;
 use endofield::pipeline::queue::Queue;
 use endofield::pipeline::runner::Wish;
-use endofield::pipeline::stage::{Sink, SinkError, Source, SourceError};
+use endofield::pipeline::stage::{Sink, SinkError, Source as _};
 use endofield::pipeline::timing::Summary;
-use endofield::recording::folder::{Recording, Video};
-use endofield::robot::hand_eye::HandEye;
-use endofield::robot::trajectory::{TimedPose, Trajectory as ArmTrajectory};
-use endofield::synthetic::organs::Anatomy;
-use endofield::synthetic::renderer::{Obstacles, Renderer, Shot, Truth};
-use endofield::synthetic::scene::{World3d, laparoscope};
-use endofield::synthetic::trajectory::{Course, Trajectory};
-use endofield::time::{Clock as _, MonotonicClock, Span, Timestamp};
-use rayon::prelude::*;
+use endofield::time::{Clock as _, MonotonicClock};
 
-const SIZE: (usize, usize) = (1920, 1080);
-/// Rendered once, played there and back.
-const PICTURES: usize = 12;
-const VIEWS: usize = 16;
-const PERIOD_S: f64 = 0.04;
-/// Every so many pixels a vertex of the surface.
-const MESH_STEP_PX: usize = 16;
+mod kernels;
+mod measure;
+mod operation;
 
-/// Which picture frame `number` shows.
-fn shown(number: u64) -> usize {
-    let phase = (number % (2 * PICTURES as u64 - 2)) as usize;
-    phase.min(2 * PICTURES - 2 - phase)
-}
+use measure::{cpu_ms, median, timed};
+use operation::{Operation, SIZE};
 
-struct ThereAndBack {
-    pictures: Vec<Image<Rgb8>>,
-    pool: Pool<Rgb8>,
-    next: u64,
-    count: u64,
-}
+/// Frames for table 1, of which the first few only warm up.
+const FRAMES_ON_ONE_CORE: u64 = 20;
+const WARM_UP: u64 = 8;
+/// The line is stopped after so long, seconds.
+const LONGEST_RUN_S: f64 = 15.0;
+/// Its time is told apart: the other stages have a bound of their own.
+const SUBSTITUTION: &str = "specularity_substitution";
 
-impl Source for ThereAndBack {
-    fn next_frame(&mut self) -> Result<Option<Frame>, SourceError> {
-        if self.next == self.count {
-            return Ok(None);
-        }
-        let number = self.next;
-        self.next += 1;
-        let at = Timestamp::from_seconds(number as f64 * PERIOD_S);
-        let mut frame = Frame::new(FrameId(number), at, at, self.pool.take_copy(&self.pictures[shown(number)]));
-        frame.since_previous = if number == 0 { Span(0) } else { Span::from_seconds(PERIOD_S) };
-        Ok(Some(frame))
-    }
+/// What stands before the substitution.
+#[derive(Clone, Copy, PartialEq)]
+enum Front {
+    Alone,
+    WithSubstitution,
 }
 
 struct Nowhere;
@@ -84,172 +61,173 @@ impl Sink for Nowhere {
     }
 }
 
-fn rendered(renderer: &Renderer, course: Course, count: usize, with_truth: bool) -> Vec<(Shot, Image<Rgb8>, Option<Truth>)> {
-    let duration_s = count as f64 * PERIOD_S;
-    let path = Trajectory::new(course, duration_s, renderer.world().world_from_organs);
-    (0..count)
-        .into_par_iter()
-        .map(|number| {
-            let seconds = number as f64 * PERIOD_S;
-            let shot = Shot {
-                frame: number as u64,
-                seconds,
-                world_from_camera: path.world_from_camera(seconds),
-                exposure: 1.0,
-                noise_key: 1,
-                obstacles: Obstacles::default(),
-            };
-            let picture = renderer.render(&shot, with_truth);
-            (shot, picture.video, picture.truth)
-        })
-        .collect()
-}
-
-/// A light field as good as truth allows, so that the line does all of its work.
-fn light_field(renderer: &Renderer, camera: &Arc<CameraModel>) -> LightField {
-    let views: Vec<View> = rendered(renderer, Course::Survey, VIEWS, true)
-        .into_iter()
-        .filter_map(|(shot, _, truth)| {
-            let truth = truth?;
-            let depth = truth
-                .depth
-                .pixels()
-                .iter()
-                .map(|hundredths| f32::from(*hundredths) * 0.01)
-                .collect();
-            let confidence = truth
-                .depth
-                .pixels()
-                .iter()
-                .map(|depth| if *depth > 0 { 255 } else { 0 })
-                .collect();
-            Some(View {
-                frame_number: shot.frame as u32,
-                image: truth.diffuse,
-                confidence: Image::from_vec(camera.width, camera.height, confidence)?,
-                depth: Image::from_vec(camera.width, camera.height, depth)?,
-                camera: Arc::clone(camera),
-                world_from_camera: shot.world_from_camera,
-                gain: [1.0; 3],
-                exposed_at: Timestamp::from_seconds(shot.seconds),
-            })
-        })
-        .collect();
-    let surface = views.get(VIEWS / 2).map(surface_of).unwrap_or_default();
-    LightField {
-        views,
-        surface,
-        recipe: "bench".to_owned(),
-        ..LightField::default()
-    }
-}
-
-/// The surface that one view sees.
-fn surface_of(view: &View) -> Mesh<World> {
-    let (columns, rows) = (view.image.width() / MESH_STEP_PX, view.image.height() / MESH_STEP_PX);
-    let mut index = vec![None; columns * rows];
-    let mut mesh = Mesh::default();
-    for row in 0..rows {
-        for column in 0..columns {
-            let (x, y) = (column * MESH_STEP_PX, row * MESH_STEP_PX);
-            let depth = f64::from(view.depth.at(x, y));
-            let ray = view.camera.unproject(Pixel {
-                x: x as f64,
-                y: y as f64,
-            });
-            if let (true, Some(ray)) = (depth > 0.0, ray) {
-                index[row * columns + column] = Some(mesh.vertices.len() as u32);
-                mesh.vertices
-                    .push(view.world_from_camera * Point::<Camera>::from_coords(ray.coords * depth));
-            }
-        }
-    }
-    for row in 1..rows {
-        for column in 1..columns {
-            let at = |r: usize, c: usize| index[r * columns + c];
-            let corners = [
-                at(row - 1, column - 1),
-                at(row - 1, column),
-                at(row, column - 1),
-                at(row, column),
-            ];
-            if let [Some(a), Some(b), Some(c), Some(d)] = corners {
-                mesh.triangles.extend([[a, c, b], [b, c, d]]);
-            }
-        }
-    }
-    mesh
-}
-
-fn main() {
-    // Cargo adds `--bench`.
-    let count: u64 = std::env::args()
-        .skip(1)
-        .find_map(|argument| argument.parse().ok())
-        .unwrap_or(150);
-    let renderer = Renderer::new(
-        World3d::new(Anatomy::GallBladder, 1, SIZE.0),
-        laparoscope(SIZE.0, SIZE.1),
-        Some(0.47),
-        1.0,
-    );
-    eprintln!("rendering {} pictures of {}x{} …", PICTURES + VIEWS, SIZE.0, SIZE.1);
-    let live = rendered(&renderer, Course::Live, PICTURES, false);
-    let light_field = light_field(&renderer, &Arc::new(renderer.camera().pinhole()));
-
-    // A perfect arm whose hand is the camera.
-    let poses = (0..count + 20).map(|number| TimedPose {
-        stamp: Timestamp::from_seconds(number as f64 * PERIOD_S),
-        base_from_hand: Transform::<RobotBase, Hand>::from_isometry(*live[shown(number)].0.world_from_camera.isometry()),
-    });
-    let recording = Recording {
-        camera: Some(renderer.camera().clone()),
-        trajectory: ArmTrajectory::new(poses.collect()),
-        hand_eye: Some(HandEye::new(Transform::identity())),
-        ..Recording::plain(Video::File("simulated".into()))
-    };
+fn line(operation: &Operation, front: Front) -> Line {
     let mut config = Config::default();
     // Colors of the start are the reference: a simulated recording has no color.yaml, and the stage shall work.
     config.color.reference = endofield::stages::color_normalization::settings::ReferenceSource::Start;
+    config.color.start_ms = 40.0;
     let equipment = Equipment {
-        recording: &recording,
-        light_field: Some(Arc::new(light_field)),
+        recording: &operation.recording,
+        light_field: Some(Arc::clone(&operation.light_field)),
         size: SIZE,
     };
-    let line = compose::line(&config, &Choice::ALL, &equipment).expect("the default line stands");
+    let mut line = compose::line(&config, &Choice::ALL, &equipment).expect("the default line stands");
+    if front == Front::Alone {
+        line.stages.retain(|stage| stage.name() != SUBSTITUTION);
+    }
+    line
+}
+
+/// What a stage costs alone on one core.
+struct Alone {
+    stage: &'static str,
+    /// Processor time, ms a frame.
+    median: f64,
+    worst: f64,
+    /// Of its pictures and masks: the same before and after a change that leaves results alone.
+    fingerprint: u32,
+}
+
+/// To be called inside a pool of one thread.
+fn on_one_core(operation: &Operation, front: Front) -> Vec<Alone> {
+    let mut stages = line(operation, front).stages;
+    let mut times = vec![Vec::new(); stages.len()];
+    let mut fingerprints = vec![0; stages.len()];
+    let mut source = operation.source(FRAMES_ON_ONE_CORE);
+    while let Ok(Some(mut frame)) = source.next_frame() {
+        for ((stage, times), fingerprint) in stages.iter_mut().zip(&mut times).zip(&mut fingerprints) {
+            let (ms, result) = timed(|| stage.process(&mut frame));
+            if let Err(error) = result {
+                println!("{} failed: {error}", stage.name());
+            }
+            if frame.id.0 >= WARM_UP {
+                times.push(ms);
+            }
+            let masks = [&frame.specularities, &frame.instruments].into_iter().flatten();
+            *fingerprint = masks.fold(hash(*fingerprint, frame.image.as_bytes()), |hashed, mask| {
+                hash(hashed, mask.pixels())
+            });
+        }
+    }
+    let rows = stages.iter().zip(times).zip(fingerprints);
+    rows.map(|((stage, times), fingerprint)| Alone {
+        stage: stage.name(),
+        worst: times.iter().copied().fold(0.0, f64::max),
+        median: median(times),
+        fingerprint,
+    })
+    .collect()
+}
+
+/// FNV-1a over words of eight bytes, folded.
+fn hash(start: u32, bytes: &[u8]) -> u32 {
+    let words = bytes
+        .chunks(8)
+        .map(|word| word.iter().fold(0, |sum, byte| sum << 8 | u64::from(*byte)));
+    let hashed = words.fold(u64::from(start) ^ 0xcbf2_9ce4_8422_2325, |hashed, word| {
+        (hashed ^ word).wrapping_mul(0x0100_0000_01b3).rotate_left(29)
+    });
+    (hashed ^ hashed >> 32) as u32
+}
+
+struct Whole {
+    outcome: Outcome,
+    seconds: f64,
+    cpu_ms: f64,
+}
+
+fn whole_line(operation: &Operation, front: Front, count: u64) -> Whole {
+    let line = line(operation, front);
     for part in &line.left_out {
         eprintln!("left out: {part}");
     }
-    let pictures = live.into_iter().map(|(_, picture, _)| picture).collect();
-    let source = ThereAndBack {
-        pictures,
-        pool: Pool::new(32),
-        next: 0,
-        count,
-    };
-    let mut builder = Pipeline::builder(Box::new(source), Arc::new(MonotonicClock));
+    let mut builder = Pipeline::builder(Box::new(operation.source(count)), Arc::new(MonotonicClock));
     for stage in line.stages {
         builder = builder.stage(stage);
     }
-    let began = MonotonicClock.now();
-    let running = builder
+    let pipeline = builder
         .sink(Box::new(Nowhere), Queue::blocking(2))
         .build()
-        .expect("the line stands")
-        .start()
-        .expect("threads");
-    let outcome = running.wait_looking(|_| Wish::GoOn);
-    let seconds = (MonotonicClock.now() - began).seconds();
+        .expect("the line stands");
+    let (began, began_cpu) = (MonotonicClock.now(), cpu_ms());
+    let outcome = pipeline.start().expect("threads").wait_looking(|_| {
+        if (MonotonicClock.now() - began).seconds() > LONGEST_RUN_S {
+            Wish::Stop
+        } else {
+            Wish::GoOn
+        }
+    });
+    Whole {
+        outcome,
+        seconds: (MonotonicClock.now() - began).seconds(),
+        cpu_ms: cpu_ms() - began_cpu,
+    }
+}
 
+fn main() {
+    let mut count = 200;
+    let mut front = Front::WithSubstitution;
+    let mut json = None;
+    // Cargo adds `--bench`.
+    let mut arguments = std::env::args().skip(1).filter(|argument| argument != "--bench");
+    while let Some(argument) = arguments.next() {
+        if argument == "--json" {
+            json = arguments.next();
+        } else if argument == "--front" {
+            front = Front::Alone;
+        } else if let Ok(number) = argument.parse::<u64>() {
+            count = number;
+        }
+    }
+    let operation = Operation::simulated(count.max(FRAMES_ON_ONE_CORE));
+    let one_core = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
+    let alone = one_core.install(|| on_one_core(&operation, front));
+    let kernels = one_core.install(|| kernels::timings(&operation));
+    let whole = whole_line(&operation, front, count);
+
+    println!("\n{:<28}{:>9}{:>9}  fingerprint", "ms a frame on one core", "median", "worst");
+    for row in &alone {
+        println!(
+            "{:<28}{:>9.2}{:>9.2}  {:08x}",
+            row.stage, row.median, row.worst, row.fingerprint
+        );
+    }
+    let sum = |wanted: fn(&str) -> bool| -> f64 { alone.iter().filter(|row| wanted(row.stage)).map(|row| row.median).sum() };
+    let (all, others) = (sum(|_| true), sum(|stage| stage != SUBSTITUTION));
+    println!("{:<28}{all:>9.2}", "all");
+    println!("{:<28}{others:>9.2}", "all but the substitution");
+    print_whole(&whole);
+    println!("\n{:<28}{:>9}", "ms a kernel on one core", "fastest");
+    for (name, ms) in &kernels {
+        println!("{name:<28}{ms:>9.2}");
+    }
+    if let Some(path) = json {
+        let fields = |rows: Vec<(&str, f64)>| -> serde_json::Map<String, serde_json::Value> {
+            rows.into_iter().map(|(name, ms)| (name.to_owned(), ms.into())).collect()
+        };
+        let report = serde_json::json!({
+            "size": SIZE,
+            "stage_ms_on_one_core": fields(alone.iter().map(|row| (row.stage, row.median)).collect()),
+            "kernel_ms_on_one_core": fields(kernels.iter().map(|row| (row.0.as_str(), row.1)).collect()),
+            "fps": whole.outcome.frames_out as f64 / whole.seconds,
+            "cpu_ms_per_frame": whole.cpu_ms / whole.outcome.frames_out.max(1) as f64,
+            "threads": threads(),
+        });
+        std::fs::write(&path, format!("{report:#}\n")).expect("the JSON file can be written");
+    }
+}
+
+fn print_whole(whole: &Whole) {
     let row = |name: &str, times: &Summary| {
         println!(
-            "{name:<26}{:>9.2}{:>9.2}{:>9.2}{:>9.2}",
+            "{name:<28}{:>9.2}{:>9.2}{:>9.2}{:>9.2}",
             times.p50_ms, times.p95_ms, times.p99_ms, times.max_ms
         );
     };
+    let outcome = &whole.outcome;
     println!(
-        "\n{:<26}{:>9}{:>9}{:>9}{:>9}",
-        "ms per frame, 1920x1080", "p50", "p95", "p99", "max"
+        "\n{:<28}{:>9}{:>9}{:>9}{:>9}",
+        "ms a frame, all at once", "p50", "p95", "p99", "max"
     );
     row("source (a copy)", &outcome.source_working.summary());
     for stage in &outcome.stages {
@@ -259,13 +237,17 @@ fn main() {
         }
     }
     row("end to end (with waiting)", &outcome.end_to_end.summary());
+    let frames = outcome.frames_out as f64;
     println!(
-        "\n{} frames in {seconds:.1} s: {:.1} fps on {} threads",
-        outcome.frames_out,
-        outcome.frames_out as f64 / seconds,
-        threads()
+        "\n{frames} frames of {}x{} in {:.1} s: {:.1} fps on {} threads; {:.1} ms of processor time a frame; memory at its peak: {}",
+        SIZE.0,
+        SIZE.1,
+        whole.seconds,
+        frames / whole.seconds,
+        threads(),
+        whole.cpu_ms / frames.max(1.0),
+        peak_memory()
     );
-    println!("memory at its peak: {}", peak_memory());
     for fault in outcome.faults() {
         println!("fault: {fault}");
     }

@@ -87,15 +87,8 @@ impl Components {
 
     fn collect_runs(&mut self, row: &[u8], y: u32) {
         let mut x = 0;
-        while x < row.len() {
-            let Some(gap) = row[x..].iter().position(|&v| v != 0) else {
-                break;
-            };
-            let begin = x + gap;
-            let end = row[begin..]
-                .iter()
-                .position(|&v| v == 0)
-                .map_or(row.len(), |length| begin + length);
+        while let Some(begin) = next_set(row, x) {
+            let end = next_clear(row, begin);
             let label = self.parents.len() as u32;
             self.parents.push(label);
             self.runs.push(Run {
@@ -151,6 +144,37 @@ impl Components {
     }
 }
 
+/// Bytes looked at in one step.
+const WORD: usize = size_of::<u64>();
+
+/// The first set pixel from `from` on.
+fn next_set(row: &[u8], mut from: usize) -> Option<usize> {
+    while let Some(word) = row.get(from..).and_then(|rest| rest.first_chunk::<WORD>()) {
+        let word = u64::from_le_bytes(*word);
+        if word != 0 {
+            return Some(from + word.trailing_zeros() as usize / 8);
+        }
+        from += WORD;
+    }
+    let rest = row.get(from..)?;
+    rest.iter().position(|&value| value != 0).map(|gap| from + gap)
+}
+
+/// The first pixel from `from` on that is not set, or the row's end.
+fn next_clear(row: &[u8], mut from: usize) -> usize {
+    while let Some(word) = row[from..].first_chunk::<WORD>() {
+        let word = u64::from_le_bytes(*word);
+        // Borrows reach beyond a zero byte only upward, so the lowest bit found is right (Mycroft 1987).
+        let zeros = word.wrapping_sub(0x0101_0101_0101_0101) & !word & 0x8080_8080_8080_8080;
+        if zeros != 0 {
+            return from + zeros.trailing_zeros() as usize / 8;
+        }
+        from += WORD;
+    }
+    let rest = &row[from..];
+    from + rest.iter().position(|&value| value == 0).unwrap_or(rest.len())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -184,6 +208,13 @@ mod tests {
         let mut painted = Image::filled(64, 48, 0);
         components.paint(&mut painted, 255, |_, _| true);
         assert_eq!(painted, noisy);
+        for y in 0..48 {
+            for x in 0..64 {
+                let plain = |wanted: fn(u8) -> bool| (x..64).find(|&u| wanted(noisy.at(u, y)));
+                assert_eq!(next_set(noisy.row(y), x), plain(|v| v != 0));
+                assert_eq!(next_clear(noisy.row(y), x), plain(|v| v == 0).unwrap_or(64));
+            }
+        }
         let area: u32 = components.regions().iter().map(|r| r.area).sum();
         assert_eq!(area as usize, noisy.pixels().iter().filter(|&&v| v != 0).count());
     }

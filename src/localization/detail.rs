@@ -5,6 +5,7 @@
 
 use crate::image::blur::{BlurScratch, gaussian_blur};
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::wide::{self, Kernel};
 
 /// Width of the finest scale, px, at most.
 const FINEST_WIDTH_PX: usize = 480;
@@ -12,6 +13,19 @@ const FINEST_WIDTH_PX: usize = 480;
 pub const SCALES: usize = 3;
 /// Surroundings: standard deviation of the blur, px of the scale.
 const SURROUNDINGS_SIGMA_PX: f32 = 5.0;
+/// Pixels treated at a time, within the first-level cache.
+const CHUNK: usize = 192;
+/// A mean of luma (in 1/256) below this is too dark to have detail.
+const MIN_LEVEL: u32 = 8;
+
+/// Which pixels of a picture take part. Masks of another size than the picture are not looked at.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Usable<'a> {
+    /// Not where one of these is set.
+    pub without: [Option<&'a Mask>; 2],
+    /// Only where this mask exceeds this level.
+    pub within: Option<(&'a Mask, u8)>,
+}
 
 /// One scale.
 #[derive(Clone, Debug)]
@@ -55,8 +69,8 @@ impl Default for DetailPyramid {
 }
 
 impl DetailPyramid {
-    /// Fill the scales from a picture; pixels for which `usable` is false take no part.
-    pub fn build(&mut self, image: &Image<Rgb8>, usable: &(dyn Fn(usize, usize) -> bool + Sync), scratch: &mut BlurScratch) {
+    /// Fill the scales from the usable pixels of a picture.
+    pub fn build(&mut self, image: &Image<Rgb8>, usable: &Usable<'_>, scratch: &mut BlurScratch) {
         let finest = image.width().div_ceil(FINEST_WIDTH_PX).max(1);
         for (index, scale) in self.scales.iter_mut().enumerate() {
             scale.step = finest << index;
@@ -77,40 +91,110 @@ impl DetailPyramid {
     }
 }
 
-/// Where a mask is zero in a picture of the same size.
-pub fn outside(mask: &Mask) -> impl Fn(usize, usize) -> bool + Sync + '_ {
-    |x, y| mask.at(x, y) == 0
-}
-
-fn shrink_picture(
-    image: &Image<Rgb8>,
-    usable: &(dyn Fn(usize, usize) -> bool + Sync),
-    step: usize,
-    luminance: &mut Image<f32>,
-    known: &mut Image<f32>,
-) {
+fn shrink_picture(image: &Image<Rgb8>, usable: &Usable<'_>, step: usize, luminance: &mut Image<f32>, known: &mut Image<f32>) {
     let (width, height) = (image.width() / step, image.height() / step);
     for plane in [&mut *luminance, &mut *known] {
         if plane.size() != (width, height) {
             plane.resize(width, height, 0.0);
         }
     }
+    let fitting = |mask: &&Mask| mask.size() == image.size();
+    let usable = Usable {
+        without: usable.without.map(|mask| mask.filter(fitting)),
+        within: usable.within.filter(|(mask, _)| mask.size() == image.size()),
+    };
+    // A step beyond the chunk would take a picture of a hundred thousand columns.
+    let step = step.min(CHUNK);
     for y in 0..height {
-        for x in 0..width {
-            let (mut sum, mut count) = (0_u32, 0_u32);
-            for v in y * step..(y + 1) * step {
-                for (u, &[r, g, b]) in image.row(v)[x * step..(x + 1) * step].iter().enumerate() {
-                    if usable(x * step + u, v) {
-                        // Rec. 601 luma in 1/256.
-                        sum += 77 * u32::from(r) + 150 * u32::from(g) + 29 * u32::from(b);
-                        count += 256;
-                    }
-                }
+        wide::run(ShrunkRow {
+            image,
+            usable,
+            step,
+            y,
+            luminance: luminance.row_mut(y),
+            known: known.row_mut(y),
+        });
+    }
+}
+
+/// One row of the finest scale.
+struct ShrunkRow<'a> {
+    image: &'a Image<Rgb8>,
+    usable: Usable<'a>,
+    step: usize,
+    y: usize,
+    luminance: &'a mut [f32],
+    known: &'a mut [f32],
+}
+
+impl Kernel for ShrunkRow<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let (step, width) = (self.step, self.image.width());
+        let chunk = CHUNK / step;
+        let full = 256 * (step * step) as u32;
+        let cells = self.luminance.chunks_mut(chunk).zip(self.known.chunks_mut(chunk));
+        for (index, (luminance, known)) in cells.enumerate() {
+            let mut sums = [0_u32; CHUNK];
+            let mut counts = [0_u16; CHUNK];
+            for v in self.y * step..(self.y + 1) * step {
+                let at = v * width + index * chunk * step;
+                add_row(self.image, &self.usable, at, &mut sums, &mut counts);
             }
-            let full = 256 * (step * step) as u32;
-            let enough = 4 * count >= 3 * full;
-            luminance.set(x, y, if count > 0 { sum as f32 / count as f32 } else { 0.0 });
-            known.set(x, y, if enough && sum > 8 * count { 1.0 } else { 0.0 });
+            for (i, (luminance, known)) in luminance.iter_mut().zip(known).enumerate() {
+                let columns = i * step..(i + 1) * step;
+                let sum: u32 = sums[columns.clone()].iter().sum();
+                let count = 256 * counts[columns].iter().map(|count| u32::from(*count)).sum::<u32>();
+                *luminance = if count > 0 { sum as f32 / count as f32 } else { 0.0 };
+                *known = if 4 * count >= 3 * full && sum > MIN_LEVEL * count {
+                    1.0
+                } else {
+                    0.0
+                };
+            }
+        }
+    }
+}
+
+/// Add luma and number of the usable ones among the [`CHUNK`] pixels from `at` on; what lies beyond the row is added too and not used.
+#[inline(always)]
+fn add_row(image: &Image<Rgb8>, usable: &Usable<'_>, at: usize, sums: &mut [u32; CHUNK], counts: &mut [u16; CHUNK]) {
+    let pixels = chunk_from(image.pixels(), at);
+    let mut mask = [255_u8; CHUNK];
+    for without in usable.without.into_iter().flatten() {
+        let without = chunk_from(without.pixels(), at);
+        for i in 0..CHUNK {
+            mask[i] = if without[i] == 0 { mask[i] } else { 0 };
+        }
+    }
+    if let Some((within, level)) = usable.within {
+        let within = chunk_from(within.pixels(), at);
+        for i in 0..CHUNK {
+            mask[i] = if within[i] > level { mask[i] } else { 0 };
+        }
+    }
+    let mut luma = [0_u16; CHUNK];
+    for i in 0..CHUNK {
+        let [r, g, b] = pixels[i].map(u16::from);
+        // Rec. 601 luma in 1/256: at most 255 · 256.
+        luma[i] = (77 * r).wrapping_add(150 * g).wrapping_add(29 * b);
+    }
+    for i in 0..CHUNK {
+        let taken = u16::from(mask[i]) * 257;
+        sums[i] = sums[i].wrapping_add(u32::from(luma[i] & taken));
+        counts[i] = counts[i].wrapping_add(taken & 1);
+    }
+}
+
+/// [`CHUNK`] values from `at` on, padded at the end of the image.
+#[inline(always)]
+fn chunk_from<P: Copy + Default>(values: &[P], at: usize) -> [P; CHUNK] {
+    match values[at..].first_chunk::<CHUNK>() {
+        Some(chunk) => *chunk,
+        None => {
+            let mut padded = [P::default(); CHUNK];
+            padded[..values.len() - at].copy_from_slice(&values[at..]);
+            padded
         }
     }
 }
@@ -152,5 +236,46 @@ fn detail_of(luminance: &Image<f32>, known: &Image<f32>, scale: &mut Scale, blur
         let usable = *w > 0.0 && *b > 0.3 && *m > 0.0;
         *m = if usable { (l * b / *m - 1.0).clamp(-0.5, 0.5) } else { 0.0 };
         *w = if usable { 1.0 } else { 0.0 };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt as _, SeedableRng as _};
+
+    #[test]
+    fn shrinking_agrees_with_its_plain_twin() {
+        for (width, height, step) in [(401, 30, 4), (197, 22, 3), (33, 9, 1)] {
+            let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(step as u64);
+            let mut mask = |share: f64| {
+                let pixels = (0..width * height).map(|_| if random.random_bool(share) { 255 } else { 0 });
+                Image::from_vec(width, height, pixels.collect()).unwrap()
+            };
+            let (without, within) = (mask(0.15), mask(0.95));
+            let image = Image::from_vec(width, height, (0..width * height).map(|_| random.random()).collect()).unwrap();
+            let usable = Usable {
+                without: [None, Some(&without)],
+                within: Some((&within, 200)),
+            };
+            let (mut luminance, mut known) = (plane(), plane());
+            shrink_picture(&image, &usable, step, &mut luminance, &mut known);
+            for y in 0..height / step {
+                for x in 0..width / step {
+                    let (mut sum, mut count) = (0_u32, 0_u32);
+                    for (u, v) in (y * step..(y + 1) * step).flat_map(|v| (x * step..(x + 1) * step).map(move |u| (u, v))) {
+                        if without.at(u, v) == 0 && within.at(u, v) > 200 {
+                            let [r, g, b] = image.at(u, v).map(u32::from);
+                            sum += 77 * r + 150 * g + 29 * b;
+                            count += 256;
+                        }
+                    }
+                    let mean = if count > 0 { sum as f32 / count as f32 } else { 0.0 };
+                    assert_eq!(luminance.at(x, y), mean);
+                    let enough = 4 * count >= 3 * 256 * (step * step) as u32 && sum > 8 * count;
+                    assert_eq!(known.at(x, y) > 0.0, enough);
+                }
+            }
+        }
     }
 }

@@ -5,14 +5,14 @@
 //! detail there, with the gradient of the picture's detail, give a Gauss–Newton step of the pose. Coarse scales first. The arm's pose
 //! stays in as a prior, so that what the picture does not tell is left to the arm.
 
-use nalgebra::{Cholesky, Matrix6, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Cholesky, Matrix3, Matrix6, UnitQuaternion, Vector3, Vector6};
 
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::blur::BlurScratch;
 use crate::light_field::view::{LightField, View};
-use crate::localization::detail::{DetailPyramid, SCALES};
+use crate::localization::detail::{DetailPyramid, SCALES, Usable};
 
 /// How a picture is aligned.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -77,6 +77,8 @@ struct Station {
     depth_mm: f64,
 }
 
+/// Pixels of a view that are less sure than this tell nothing about its detail.
+const MIN_CONFIDENCE: u8 = 200;
 /// Points per view at the scales, finest first.
 const ANCHORS: [usize; SCALES] = [1400, 700, 300];
 /// Gauss–Newton steps at the scales, finest first.
@@ -160,18 +162,18 @@ impl ImageAligner {
     ) -> Option<Vector6<f64>> {
         let level = &pyramid.scales[scale];
         let intrinsics = camera.intrinsics.scaled(1.0 / level.step as f64);
-        let camera_from_world = pose.inverse();
-        let mut normal = Matrix6::<f64>::zeros();
-        let mut right = Vector6::<f64>::zeros();
+        let camera_from_world = Motion::of(&pose.inverse());
+        let mut sums = NormalEquations::default();
         let (mut count, mut energy) = (0_usize, 0.0_f64);
         let residual_scale = 0.05;
         for &(_, view) in &self.nearest {
             for anchor in &self.anchors[view][scale] {
-                let p = camera_from_world.isometry() * nalgebra::Point3::from(anchor.position);
+                let p = camera_from_world.apply(&anchor.position);
                 if p.z < 1e-6 {
                     continue;
                 }
-                let (x, y) = (p.x / p.z, p.y / p.z);
+                let inverse_z = 1.0 / p.z;
+                let (x, y) = (p.x * inverse_z, p.y * inverse_z);
                 let Some((value, gx, gy)) = sample(
                     &level.detail,
                     &level.weight,
@@ -183,12 +185,14 @@ impl ImageAligner {
                 let residual = f64::from(value - anchor.detail);
                 // Cauchy: what moved, was wiped or shines in one picture only has little say.
                 let weight = 1.0 / (1.0 + (residual / residual_scale).powi(2));
-                let (a, b) = (f64::from(gx) * intrinsics.fx / p.z, f64::from(gy) * intrinsics.fy / p.z);
+                let (a, b) = (
+                    f64::from(gx) * intrinsics.fx * inverse_z,
+                    f64::from(gy) * intrinsics.fy * inverse_z,
+                );
                 let c = -(a * x + b * y);
                 // d detail / d twist for p' = p + t + w × p.
-                let row = Vector6::new(a, b, c, c * p.y - b * p.z, a * p.z - c * p.x, b * p.x - a * p.y);
-                normal += weight * row * row.transpose();
-                right -= weight * residual * row;
+                let row = [a, b, c, c * p.y - b * p.z, a * p.z - c * p.x, b * p.x - a * p.y];
+                sums.add(&row, residual, weight);
                 energy += weight * residual * residual;
                 count += 1;
             }
@@ -196,6 +200,7 @@ impl ImageAligner {
         if count < 40 {
             return None;
         }
+        let (mut normal, mut right) = sums.matrix_and_side();
         // Neighbouring pixels are not independent: the prior weighs as much as a tenth of the points would.
         let variance = (energy / count as f64).max(1e-6) * 10.0;
         if let Some(prior) = prior {
@@ -231,19 +236,20 @@ impl ImageAligner {
     ) -> (f32, f32) {
         let level = &pyramid.scales[scale];
         let intrinsics = camera.intrinsics.scaled(1.0 / level.step as f64);
-        let camera_from_world = pose.inverse();
+        let camera_from_world = Motion::of(&pose.inverse());
         let (mut seen, mut all) = (0.0_f64, 0.0_f64);
         let (mut xy, mut xx, mut yy) = (0.0_f64, 1e-9_f64, 1e-9_f64);
         for &(_, view) in &self.nearest {
             for anchor in &self.anchors[view][scale] {
                 all += 1.0;
-                let p = camera_from_world.isometry() * nalgebra::Point3::from(anchor.position);
+                let p = camera_from_world.apply(&anchor.position);
                 if p.z < 1e-6 {
                     continue;
                 }
+                let inverse_z = 1.0 / p.z;
                 let (u, v) = (
-                    intrinsics.fx * p.x / p.z + intrinsics.cx,
-                    intrinsics.fy * p.y / p.z + intrinsics.cy,
+                    intrinsics.fx * p.x * inverse_z + intrinsics.cx,
+                    intrinsics.fy * p.y * inverse_z + intrinsics.cy,
                 );
                 if let Some((value, _, _)) = sample(&level.detail, &level.weight, u, v) {
                     let (a, b) = (f64::from(value), f64::from(anchor.detail));
@@ -283,6 +289,52 @@ impl ImageAligner {
             }
         }
         if count > 0.0 { (sum / count).sqrt() as f32 } else { 0.0 }
+    }
+}
+
+/// A rigid motion with its rotation as a matrix: a third of the work of a quaternion per point.
+#[derive(Clone, Copy, Debug)]
+struct Motion {
+    rotation: Matrix3<f64>,
+    translation: Vector3<f64>,
+}
+
+impl Motion {
+    fn of<To, From>(transform: &Transform<To, From>) -> Self {
+        Self {
+            rotation: transform.rotation().to_rotation_matrix().into_inner(),
+            translation: transform.translation(),
+        }
+    }
+
+    #[inline]
+    fn apply(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation * point + self.translation
+    }
+}
+
+/// Sums of a least-squares problem in six unknowns; of the symmetric matrix one half.
+#[derive(Clone, Copy, Debug, Default)]
+struct NormalEquations {
+    half: [[f64; 6]; 6],
+    side: [f64; 6],
+}
+
+impl NormalEquations {
+    #[inline]
+    fn add(&mut self, row: &[f64; 6], residual: f64, weight: f64) {
+        for i in 0..6 {
+            let weighted = weight * row[i];
+            for j in i..6 {
+                self.half[i][j] += weighted * row[j];
+            }
+            self.side[i] -= weighted * residual;
+        }
+    }
+
+    fn matrix_and_side(&self) -> (Matrix6<f64>, Vector6<f64>) {
+        let matrix = Matrix6::from_fn(|i, j| self.half[i.min(j)][i.max(j)]);
+        (matrix, Vector6::from(self.side))
     }
 }
 
@@ -336,11 +388,11 @@ fn station_of(view: &View) -> Station {
 /// The points with the strongest gradients, spread over the view by a grid of cells.
 fn anchors_of(view: &View) -> [Vec<Anchor>; SCALES] {
     let mut pyramid = DetailPyramid::default();
-    pyramid.build(
-        &view.image,
-        &|x, y| view.confidence.at(x, y) > 200,
-        &mut BlurScratch::default(),
-    );
+    let usable = Usable {
+        within: Some((&view.confidence, MIN_CONFIDENCE)),
+        ..Usable::default()
+    };
+    pyramid.build(&view.image, &usable, &mut BlurScratch::default());
     std::array::from_fn(|index| {
         let level = &pyramid.scales[index];
         let (width, height) = level.detail.size();

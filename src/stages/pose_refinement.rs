@@ -10,7 +10,7 @@ use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::blur::BlurScratch;
 use crate::light_field::view::LightField;
-use crate::localization::detail::DetailPyramid;
+use crate::localization::detail::{DetailPyramid, Usable};
 use crate::localization::image_alignment::{self, ImageAligner};
 use crate::pipeline::stage::{Stage, StageError};
 
@@ -109,17 +109,11 @@ impl Stage for PoseRefinement {
         if frame.scene_cut {
             self.reset();
         }
-        {
-            let specular = frame.specularities.as_deref();
-            let instruments = frame.instruments.as_deref();
-            let field = frame.field_of_view.as_deref();
-            let usable = |x: usize, y: usize| {
-                specular.is_none_or(|m| m.at(x, y) == 0)
-                    && instruments.is_none_or(|m| m.at(x, y) == 0)
-                    && field.is_none_or(|m| m.at(x, y) != 0)
-            };
-            self.pyramid.build(&frame.image, &usable, &mut self.scratch);
-        }
+        let usable = Usable {
+            without: [frame.specularities.as_deref(), frame.instruments.as_deref()],
+            within: frame.field_of_view.as_deref().map(|field| (field, 0)),
+        };
+        self.pyramid.build(&frame.image, &usable, &mut self.scratch);
         let prior = frame.world_from_camera;
         let aligned = self
             .best_guess(frame, &camera)

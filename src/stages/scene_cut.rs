@@ -35,12 +35,19 @@ impl Signature {
         let mut histogram = [0_u32; BINS];
         for y in (0..height).step_by(STEP) {
             let row_of_cells = y * ROWS / height * COLUMNS;
-            for (x, color) in image.row(y).iter().enumerate().step_by(STEP) {
-                let gray = (u32::from(color[0]) + 2 * u32::from(color[1]) + u32::from(color[2])) / 4;
-                let cell = row_of_cells + x * COLUMNS / width;
-                sums[cell] += gray;
-                counts[cell] += 1;
-                histogram[gray as usize * BINS / 256] += 1;
+            let row = image.row(y);
+            for (column, cell) in (row_of_cells..row_of_cells + COLUMNS).enumerate() {
+                // The samples whose x · COLUMNS / width is `column`.
+                let first = |column: usize| (column * width).div_ceil(COLUMNS).next_multiple_of(STEP);
+                let (mut x, end) = (first(column), first(column + 1).min(width));
+                while x < end {
+                    let [r, g, b] = row[x].map(u32::from);
+                    let gray = (r + 2 * g + b) / 4;
+                    sums[cell] += gray;
+                    counts[cell] += 1;
+                    histogram[gray as usize * BINS / 256] += 1;
+                    x += STEP;
+                }
             }
         }
         let total = counts.iter().sum::<u32>().max(1) as f32;

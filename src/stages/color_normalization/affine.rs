@@ -98,7 +98,7 @@ pub fn weight(color: [f32; 3]) -> f32 {
 }
 
 /// Pixels at a time, split into channels within the first-level cache.
-const CHUNK: usize = 256;
+const CHUNK: usize = 128;
 
 /// Apply a map to a run of pixels.
 #[derive(Debug)]
@@ -122,9 +122,14 @@ impl Kernel for AffineRun<'_> {
             target,
             field_of_view,
         } = self;
-        for (source, target) in source.chunks(CHUNK).zip(target.chunks_mut(CHUNK)) {
-            chunk(&map, source, target);
+        let (sources, rest) = source.as_chunks::<CHUNK>();
+        let (targets, rest_target) = target.as_chunks_mut::<CHUNK>();
+        for (source, target) in sources.iter().zip(targets) {
+            *target = chunk(&map, source);
         }
+        let mut padded = [[0; 3]; CHUNK];
+        padded[..rest.len()].copy_from_slice(rest);
+        rest_target.copy_from_slice(&chunk(&map, &padded)[..rest.len()]);
         if !field_of_view.is_empty() {
             keep_surround(source, target, field_of_view);
         }
@@ -149,25 +154,24 @@ fn byte_from(value: f32) -> u8 {
     (value.clamp(0.0, 255.0) + INTEGER_BITS).to_bits() as u8
 }
 
+/// The length is fixed and known, so that nothing is left over for a loop over single pixels.
 #[inline(always)]
-fn chunk(map: &Affine, source: &[Rgb8], target: &mut [Rgb8]) {
-    let n = source.len().min(CHUNK);
+fn chunk(map: &Affine, source: &[Rgb8; CHUNK]) -> [Rgb8; CHUNK] {
     let (mut red, mut green, mut blue) = ([0_u8; CHUNK], [0_u8; CHUNK], [0_u8; CHUNK]);
-    let (red, green, blue) = (&mut red[..n], &mut green[..n], &mut blue[..n]);
-    for (i, color) in source.iter().enumerate() {
-        red[i] = color[0];
-        green[i] = color[1];
-        blue[i] = color[2];
+    for i in 0..CHUNK {
+        [red[i], green[i], blue[i]] = source[i];
     }
-    for i in 0..n {
+    for i in 0..CHUNK {
         let [r, g, b] = map.apply_blended([f32::from(red[i]), f32::from(green[i]), f32::from(blue[i])]);
         red[i] = byte_from(r);
         green[i] = byte_from(g);
         blue[i] = byte_from(b);
     }
-    for (i, color) in target.iter_mut().enumerate() {
-        *color = [red[i], green[i], blue[i]];
+    let mut target = [[0; 3]; CHUNK];
+    for i in 0..CHUNK {
+        target[i] = [red[i], green[i], blue[i]];
     }
+    target
 }
 
 #[cfg(test)]

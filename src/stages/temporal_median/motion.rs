@@ -6,7 +6,7 @@
 //! The mean signed difference is tested too: it finds a faint shadow, or the lamp getting brighter, far below the noise.
 
 use crate::image::wide::Kernel;
-use crate::stages::temporal_median::noise::Noise;
+use crate::stages::temporal_median::noise::{Noise, NoiseTable};
 
 /// Edge of a block, px.
 pub const BLOCK: usize = 16;
@@ -161,14 +161,15 @@ fn texture(gray: &[u8], width: usize, left: usize, columns: usize, stats: &mut B
 /// Judge every block; `columns` blocks a row.
 pub fn classify(stats: &[BlockStats], columns: usize, noise: &Noise, motions: &mut [Motion]) {
     let rows = stats.len() / columns.max(1);
+    let noise = noise.table();
     for y in 0..rows {
         for x in 0..columns {
-            motions[y * columns + x] = judge(stats, columns, rows, (x, y), noise);
+            motions[y * columns + x] = judge(stats, columns, rows, (x, y), &noise);
         }
     }
 }
 
-fn judge(stats: &[BlockStats], columns: usize, rows: usize, (x, y): (usize, usize), noise: &Noise) -> Motion {
+fn judge(stats: &[BlockStats], columns: usize, rows: usize, (x, y): (usize, usize), noise: &NoiseTable) -> Motion {
     let block = &stats[y * columns + x];
     let pair_variance = 2.0 * noise.variance_at(block.level);
     let mut still = true;

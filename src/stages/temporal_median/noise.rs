@@ -62,6 +62,20 @@ pub struct Noise {
     variance: [Option<f32>; LEVELS],
 }
 
+/// [`Noise::variance_at`] looked up.
+#[derive(Clone, Copy, Debug)]
+pub struct NoiseTable {
+    variance: [f32; LEVELS],
+}
+
+impl NoiseTable {
+    /// Variance at a brightness, levels².
+    #[inline]
+    pub fn variance_at(&self, level: f32) -> f32 {
+        self.variance[bin_of(level)]
+    }
+}
+
 impl Default for Noise {
     fn default() -> Self {
         Self {
@@ -84,6 +98,13 @@ impl Noise {
             .flatten()
             .find_map(|bin| self.variance.get(bin).copied().flatten())
             .unwrap_or(1.0)
+    }
+
+    /// The variances at all brightnesses, for asking often.
+    pub fn table(&self) -> NoiseTable {
+        NoiseTable {
+            variance: std::array::from_fn(|bin| self.variance_at((bin as f32 + 0.5) * 256.0 / LEVELS as f32)),
+        }
     }
 
     /// Learn from one frame's blocks.
@@ -132,5 +153,9 @@ mod tests {
         noise.variance[2] = Some(4.0);
         assert_eq!(noise.variance_at(40.0), 4.0);
         assert_eq!(noise.variance_at(250.0), 9.0);
+        for level in 0..256 {
+            let level = level as f32;
+            assert_eq!(noise.table().variance_at(level), noise.variance_at(level));
+        }
     }
 }

@@ -12,8 +12,8 @@ use crate::image::wide::Kernel;
 use crate::stages::temporal_median::history::Planes;
 use crate::stages::temporal_median::settings::{Distance, Method};
 
-/// Pixels at a time: results stay in the first-level cache until they are interleaved.
-const CHUNK: usize = 256;
+/// Pixels at a time. A shorter rest costs as much as a whole chunk, and between moving blocks runs are short.
+const CHUNK: usize = 64;
 
 /// A color, widened.
 pub type Wide = [i16; 3];
@@ -44,9 +44,9 @@ where
     #[inline(always)]
     fn run(self) {
         match (self.method, self.distance) {
-            (Method::Marginal, _) => self.with(|colors| colors.marginal_median()),
-            (Method::Vector, Distance::L1) => self.with(|colors| colors.vector_median(l1)),
-            (Method::Vector, Distance::L2) => self.with(|colors| colors.vector_median(l2)),
+            (Method::Marginal, _) => self.by::<Marginal>(),
+            (Method::Vector, Distance::L1) => self.by::<VectorL1>(),
+            (Method::Vector, Distance::L2) => self.by::<VectorL2>(),
         }
     }
 }
@@ -56,7 +56,7 @@ where
     [Wide; N]: Colors<N>,
 {
     #[inline(always)]
-    fn with(self, choose: impl Fn([Wide; N]) -> Wide) {
+    fn by<M: Median>(self) {
         let Self {
             window,
             start,
@@ -75,15 +75,21 @@ where
             let n = median.len().min(CHUNK);
             for (colors, planes) in colors.iter_mut().zip(&window) {
                 for (color, plane) in colors.iter_mut().zip(&planes.color) {
-                    for (color, level) in color.iter_mut().zip(&plane[at..at + n]) {
-                        *color = i16::from(*level);
-                    }
+                    // Past the run's end the neighbours are computed along; only the picture's last chunk is padded.
+                    *color = match plane[at..].first_chunk::<CHUNK>() {
+                        Some(levels) => widened(levels),
+                        None => {
+                            let mut padded = [0; CHUNK];
+                            padded[..n].copy_from_slice(&plane[at..at + n]);
+                            widened(&padded)
+                        }
+                    };
                 }
             }
             let [red, green, blue, far] = &mut results;
             for i in 0..CHUNK {
                 let pixel = <[Wide; N]>::gather(&colors, i);
-                let [r, g, b] = choose(pixel);
+                let [r, g, b] = M::of(pixel);
                 let [now_r, now_g, now_b] = pixel[0];
                 let apart = |a: i16, b: i16| a.wrapping_sub(b).wrapping_abs();
                 let apart = apart(r, now_r).max(apart(g, now_g)).max(apart(b, now_b));
@@ -92,15 +98,84 @@ where
                 green[i] = g;
                 blue[i] = b;
             }
-            for (i, pixel) in median.iter_mut().enumerate() {
-                *pixel = [red[i] as u8, green[i] as u8, blue[i] as u8];
+            let [red, green, blue, far] = [narrowed(red), narrowed(green), narrowed(blue), narrowed(far)];
+            let mut pixels = [[0; 3]; CHUNK];
+            for i in 0..CHUNK {
+                pixels[i] = [red[i], green[i], blue[i]];
             }
-            for (departs, far) in departs.iter_mut().zip(far.iter()) {
-                *departs = *far as u8;
+            match (median.first_chunk_mut::<CHUNK>(), departs.first_chunk_mut::<CHUNK>()) {
+                (Some(median), Some(departs)) => {
+                    *median = pixels;
+                    *departs = far;
+                }
+                _ => {
+                    median.copy_from_slice(&pixels[..n]);
+                    departs.copy_from_slice(&far[..n]);
+                }
             }
             at += n;
         }
     }
+}
+
+#[inline(always)]
+fn widened(levels: &[u8; CHUNK]) -> [i16; CHUNK] {
+    let mut wide = [0; CHUNK];
+    for i in 0..CHUNK {
+        wide[i] = i16::from(levels[i]);
+    }
+    wide
+}
+
+/// One of the medians. A closure would do, but cannot be forced inline: where the compiler leaves it outside, the loop is scalar and
+/// ten times slower.
+trait Median {
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>;
+}
+
+struct Marginal;
+struct VectorL1;
+struct VectorL2;
+
+impl Median for Marginal {
+    #[inline(always)]
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>,
+    {
+        colors.marginal_median()
+    }
+}
+
+impl Median for VectorL1 {
+    #[inline(always)]
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>,
+    {
+        colors.vector_median(l1)
+    }
+}
+
+impl Median for VectorL2 {
+    #[inline(always)]
+    fn of<const N: usize>(colors: [Wide; N]) -> Wide
+    where
+        [Wide; N]: Colors<N>,
+    {
+        colors.vector_median(l2)
+    }
+}
+
+#[inline(always)]
+fn narrowed(levels: &[i16; CHUNK]) -> [u8; CHUNK] {
+    let mut narrow = [0; CHUNK];
+    for i in 0..CHUNK {
+        narrow[i] = levels[i] as u8;
+    }
+    narrow
 }
 
 #[inline(always)]
