@@ -15,9 +15,9 @@ use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
 /// At most so many views speak in a block, the loudest.
 const MAX_VOICES: usize = 16;
 /// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
-const BRIGHTER_HALF_LEVELS: f32 = 2.5;
+const BRIGHTER_HALF_LEVELS: f32 = 0.8;
 /// Rounds of that.
-const ROUNDS: usize = 2;
+const ROUNDS: usize = 5;
 
 /// What the light field shows over the holes of a frame; keeps its memory.
 #[derive(Debug)]
@@ -219,7 +219,7 @@ impl Bench {
                 Drawn {
                     color: std::array::from_fn(|c| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS),
                     // Clean sights outshout hazy ones by far more than the confidences alone.
-                    weight: loud * confidence.powf(ex(1, 2.0)),
+                    weight: loud * confidence * confidence,
                     confidence,
                 }
             }));
@@ -232,11 +232,11 @@ impl Bench {
         let drawn = || (0..self.speakers.len()).map(|s| &self.drawn[s * count + k]);
         let mut reference = f32::INFINITY;
         let mut result = None;
-        for _ in 0..=ex(2, ROUNDS as f32) as usize {
+        for _ in 0..=ROUNDS {
             let (mut sum, mut total, mut confidence) = ([0.0_f32; 3], 0.0_f32, 0.0_f32);
             let mut loudest = (0.0_f32, 0);
             for (index, view) in drawn().enumerate() {
-                let brighter = (luminance(view.color) - reference).max(0.0) / ex(0, BRIGHTER_HALF_LEVELS);
+                let brighter = (luminance(view.color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
                 let weight = view.weight / (1.0 + brighter * brighter);
                 for (sum, channel) in sum.iter_mut().zip(view.color) {
                     *sum += weight * channel;
@@ -256,9 +256,4 @@ impl Bench {
         }
         result
     }
-}
-
-pub fn ex(i: usize, d: f32) -> f32 {
-    static V: std::sync::OnceLock<Vec<Option<f32>>> = std::sync::OnceLock::new();
-    V.get_or_init(|| std::env::var("EX").unwrap_or_default().split(',').map(|t| t.parse().ok()).collect()).get(i).copied().flatten().unwrap_or(d)
 }

@@ -11,6 +11,9 @@ use crate::stages::specularity_substitution::settings::Settings;
 /// Below this share of the new colour a pixel stays as it was.
 const LEAST_SHARE: f32 = 0.02;
 
+/// At the end of its reach a replacement wants so much more evidence, levels.
+const FAR_DOUBT_LEVELS: f32 = 4.0;
+
 /// Planes to fill, all of the picture's size.
 #[derive(Debug)]
 pub struct Planes<'a> {
@@ -61,10 +64,11 @@ pub fn replace(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, planes: 
 fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y: usize) -> f32 {
     // Noise does not decide: the mean over 3 × 3 pixels.
     let excess = mean_of_neighbours(canvas, x, y).max(0.6 * canvas.excess.at(x, y));
-    let (low, high) = (settings.excess_low_levels, settings.excess_high_levels);
-    let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
     let near = (1.0 - f32::from(scene.distance.at(x, y)) / f32::from(scene.reach)).clamp(0.0, 1.0);
-    smooth(brighter) * smooth((2.0 * near).min(1.0))
+    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0);
+    let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
+    let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
+    smooth(brighter) * smooth((4.0 * near).min(1.0))
 }
 
 fn smooth(t: f32) -> f32 {
