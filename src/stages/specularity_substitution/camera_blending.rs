@@ -32,7 +32,7 @@ const WORTH_OF_NEXT: [f32; WANTED_SIGHTINGS] = [1.0, 0.15, 0.05];
 const WORTH_OF_A_GLIMPSE: f32 = 0.3;
 
 /// A view that speaks at a neighbouring corner already costs this much less, rad: fewer views are drawn, and they change less often.
-const WORTH_OF_COMPANY: f32 = 0.03;
+const WORTH_OF_COMPANY: f32 = 0.08;
 
 /// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
 const HEARD_FROM: u8 = 120;
@@ -188,6 +188,8 @@ impl CameraBlending {
         let neighbours = [
             (i > 0).then(|| &self.corners[j * across + i - 1]),
             (j > 0).then(|| &self.corners[(j - 1) * across + i]),
+            (i > 0 && j > 0).then(|| &self.corners[(j - 1) * across + i - 1]),
+            (j > 0 && i + 1 < across).then(|| &self.corners[(j - 1) * across + i + 1]),
         ];
         let penalties = &self.penalties[(j * across + i) * views..][..views];
         let bits = |view: usize, least: u8| -> u64 {

@@ -1,5 +1,7 @@
 //! The frame in cells: sums over cells, smoothed, are the fields that the substitution carries into its holes.
 
+use crate::image::wide;
+
 /// The ring around a hole is looked at in a picture of about this width, px.
 const SMALL_WIDTH_PX: f32 = 480.0;
 /// Pixels of that picture along a cell.
@@ -182,22 +184,58 @@ fn neighbours(fine: usize, count: usize) -> (usize, usize, f32) {
 
 /// The mean over a square of cells within `span`, cells outside counting as empty.
 fn box_mean(cells: &mut [Sums], across: usize, span: Span, rows: &mut [Sums]) {
-    let share = 1.0 / (2 * RADIUS + 1) as f32;
-    for y in span.rows() {
-        let source = &cells[span.row(y, across)];
-        for (x, out) in rows[span.row(y, across)].iter_mut().enumerate() {
-            *out = [0.0; 8];
-            for cell in &source[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(source.len())] {
-                add(out, cell, share);
+    wide::run(BoxMean {
+        cells,
+        across,
+        span,
+        rows,
+    });
+}
+
+struct BoxMean<'a> {
+    cells: &'a mut [Sums],
+    across: usize,
+    span: Span,
+    rows: &'a mut [Sums],
+}
+
+impl wide::Kernel for BoxMean<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let share = 1.0 / (2 * RADIUS + 1) as f32;
+        for y in self.span.rows() {
+            let source = &self.cells[self.span.row(y, self.across)];
+            let out = &mut self.rows[self.span.row(y, self.across)];
+            for x in 0..source.len() {
+                let mut sum = [0.0_f32; 8];
+                for cell in &source[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(source.len())] {
+                    for i in 0..8 {
+                        sum[i] += cell[i];
+                    }
+                }
+                for i in 0..8 {
+                    out[x][i] = share * sum[i];
+                }
             }
         }
-    }
-    for y in span.rows() {
-        let out = &mut cells[span.row(y, across)];
-        out.fill([0.0; 8]);
-        for v in y.saturating_sub(RADIUS).max(span.top)..(y + RADIUS + 1).min(span.bottom) {
-            for (out, cell) in out.iter_mut().zip(&rows[span.row(v, across)]) {
-                add(out, cell, share);
+        for y in self.span.rows() {
+            let out = &mut self.cells[self.span.row(y, self.across)];
+            let (begin, end) = (
+                y.saturating_sub(RADIUS).max(self.span.top),
+                (y + RADIUS + 1).min(self.span.bottom),
+            );
+            out.copy_from_slice(&self.rows[self.span.row(begin, self.across)]);
+            for v in begin + 1..end {
+                for (out, cell) in out.iter_mut().zip(&self.rows[self.span.row(v, self.across)]) {
+                    for i in 0..8 {
+                        out[i] += cell[i];
+                    }
+                }
+            }
+            for out in out {
+                for value in out {
+                    *value *= share;
+                }
             }
         }
     }

@@ -13,6 +13,8 @@ pub const DARK_LEVELS: f32 = 6.0;
 pub struct LivePixel {
     /// Mean colour, levels.
     pub color: [f32; 3],
+    /// Luma with [`DARK_LEVELS`] added.
+    pub brightness: f32,
     /// Depth, mm; 0 where the pixel shows the lamp, an instrument or nothing, or is too far from any hole to matter.
     pub depth: f32,
 }
@@ -76,11 +78,10 @@ impl Live {
                 for y in 0..SMALL_PER_CELL {
                     let row = &self.pixels[begin + y * width..][..SMALL_PER_CELL];
                     for pixel in row.iter().filter(|p| p.depth > 0.0) {
-                        let brightness = luminance(pixel.color) + DARK_LEVELS;
                         sums[0] += 1.0;
-                        sums[1] += brightness;
+                        sums[1] += pixel.brightness;
                         if deviation {
-                            sums[2] += (brightness / mean.max(1.0) - 1.0).powi(2);
+                            sums[2] += (pixel.brightness / mean.max(1.0) - 1.0).powi(2);
                         }
                     }
                 }
@@ -127,6 +128,7 @@ fn look_at_row(scene: &Scene<'_>, row: usize, pixels: &mut [LivePixel], holes: &
         }
         let count = (step * step) as f32;
         pixel.color = sum.map(|s| s as f32 / count);
+        pixel.brightness = luminance(pixel.color) + DARK_LEVELS;
         if pixel.color.iter().any(|&c| c < 250.0) {
             pixel.depth = scene.depth_at(x, y);
         }

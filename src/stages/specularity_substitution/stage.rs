@@ -142,6 +142,7 @@ impl SpecularitySubstitution {
         self.blending.choose(&scene, &self.mappings);
         self.live.look(&scene);
         let count = assign_slots(&scene, &self.blending, &mut self.fits, &mut self.slots);
+        if std::env::var_os("EOF_DEBUG").is_some() { eprintln!("views {count} corners {}", self.blending.corners().iter().filter(|c| !c.voices().is_empty()).count()); }
         let (live, small_views, mappings, settings) = (&self.live, &self.small_views, &self.mappings, &self.settings);
         self.fits[..count].par_iter_mut().with_max_len(1).for_each(|fit| {
             if let Some(mapping) = &mappings[fit.view] {

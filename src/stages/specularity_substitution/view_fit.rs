@@ -7,7 +7,7 @@
 use crate::image::buffer::Image;
 use crate::light_field::mapping::Mapping;
 use crate::light_field::view::View;
-use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, SMALL_PER_CELL, Smoother, Span, Sums, step_for};
+use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, SMALL_PER_CELL, Smoother, Span, Sums, step_for};
 use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live, luminance};
 use crate::stages::specularity_substitution::lookup::{bilinear_with_confidence, is_unoccluded};
 use crate::stages::specularity_substitution::scene::Scene;
@@ -144,6 +144,7 @@ impl ViewFit {
                 continue;
             }
             let field = self.field[cell];
+            let gain = mean_gain(&field);
             let begin = (cell / grid.across) * SMALL_PER_CELL * width + (cell % grid.across) * SMALL_PER_CELL;
             let mut sums = [0.0; 8];
             for row in 0..SMALL_PER_CELL {
@@ -167,7 +168,7 @@ impl ViewFit {
                     let seen = luminance(color) + DARK_LEVELS;
                     self.brightness[index] = seen;
                     let weight = if again {
-                        let residual = (luminance(pixel.color) + DARK_LEVELS) / (mean_gain(&field) * seen) - 1.0;
+                        let residual = pixel.brightness / (gain * seen) - 1.0;
                         1.0 / (1.0 + (residual / (2.0 * EXPECTED_RESIDUAL)).powi(2))
                     } else {
                         1.0
@@ -203,9 +204,10 @@ impl ViewFit {
         self.equations.resize(grid.count(), [0.0; 8]);
         for cell in 0..grid.count() {
             let (row, column) = (cell / grid.across, cell % grid.across);
-            if self.context[cell] == 0 {
+            if self.context[cell] == 0 || self.sums[cell][0] <= 0.0 {
                 continue;
             }
+            let gains = self.gains_around(grid, column, row);
             let mut sums = [0.0_f32; 8];
             for y in (row * SMALL_PER_CELL).max(1)..((row + 1) * SMALL_PER_CELL).min(height - 1) {
                 for x in (column * SMALL_PER_CELL).max(1)..((column + 1) * SMALL_PER_CELL).min(width - 1) {
@@ -215,9 +217,8 @@ impl ViewFit {
                     if seen[i] <= 0.0 || around.iter().any(|&b| b <= 0.0) {
                         continue;
                     }
-                    let at = |i: usize| luminance(live.pixels[i].color) + DARK_LEVELS;
-                    let field = grid.between(&self.field, (x * grid.step) as f32, (y * grid.step) as f32);
-                    let expected = mean_gain(&field) * seen[i];
+                    let at = |i: usize| live.pixels[i].brightness;
+                    let expected = between(&gains, x % SMALL_PER_CELL, y % SMALL_PER_CELL) * seen[i];
                     let shown = at(i);
                     let residual = shown / expected - 1.0;
                     // The mean of both gradients halves the bias of noise (efficient second order, Malis 2004).
@@ -236,6 +237,15 @@ impl ViewFit {
             }
             self.equations[cell] = sums;
         }
+    }
+
+    /// The mean gains of a cell and the eight around it, row by row.
+    fn gains_around(&self, grid: Grid, column: usize, row: usize) -> [[f32; 3]; 3] {
+        let near = |place: usize, step: usize, count: usize| (place + step).saturating_sub(1).min(count - 1);
+        std::array::from_fn(|j| {
+            let begin = near(row, j, grid.down) * grid.across;
+            std::array::from_fn(|i| mean_gain(&self.field[begin + near(column, i, grid.across)]))
+        })
     }
 
     /// How well the view fits, from the difference that is left.
@@ -282,6 +292,19 @@ impl ViewFit {
         }
         sums
     }
+}
+
+/// A value at small pixel (x, y) of the middle of 3 × 3 cells, linear between their centres.
+#[inline]
+fn between(cells: &[[f32; 3]; 3], x: usize, y: usize) -> f32 {
+    let axis = |v: usize| {
+        let place = 0.5 + (v as f32 + 0.5) / SMALL_PER_CELL as f32;
+        (place as usize, place - (place as usize) as f32)
+    };
+    let ((i, fx), (j, fy)) = (axis(x), axis(y));
+    let across = |row: &[f32; 3]| row[i] + (row[i + 1] - row[i]) * fx;
+    let (top, bottom) = (across(&cells[j]), across(&cells[j + 1]));
+    top + (bottom - top) * fy
 }
 
 fn mean_gain(field: &Sums) -> f32 {
