@@ -14,6 +14,10 @@ use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
 
 /// At most so many views speak in a block, the loudest.
 const MAX_VOICES: usize = 16;
+/// So many clean sights of a pixel are enough.
+const ENOUGH_VIEWS: u16 = 5;
+/// A sight is clean from this confidence on.
+const CLEAN: u8 = 230;
 /// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
 const BRIGHTER_HALF_LEVELS: f32 = 0.8;
 /// Rounds of that.
@@ -51,6 +55,18 @@ struct Spot {
     x: u16,
     y: u16,
     depth: f32,
+    /// Luma of the live pixel, levels.
+    live: f32,
+    /// How many views were heard that saw it clean, and the sum of their luma.
+    clean: u16,
+    luma: f32,
+}
+
+impl Spot {
+    /// True once more views would change nothing: enough have spoken, or two say that there is nothing to replace.
+    fn is_settled(&self) -> bool {
+        self.clean >= ENOUGH_VIEWS || self.clean >= 2 && self.live <= self.luma / f32::from(self.clean)
+    }
 }
 
 /// A view's colour for a spot, and how loud.
@@ -119,11 +135,10 @@ impl Canvas {
                         let spot = bench.spots[k];
                         if let Some((blended, confidence, loudest)) = bench.blended(k) {
                             let index = (usize::from(spot.y) - j * scene.grid.block()) * width + usize::from(spot.x);
-                            let live = scene.image.at(spot.x.into(), spot.y.into()).map(f32::from);
                             color[index] = blended.map(|v| (v + 0.5) as u8);
                             belief[index] = (255.0 * confidence).clamp(1.0, 255.0) as u8;
                             source[index] = chosen.fits[bench.speakers[loudest].slot].view as u16;
-                            excess[index] = luminance(live) - luminance(blended);
+                            excess[index] = spot.live - luminance(blended);
                         }
                     }
                 }
@@ -147,8 +162,14 @@ impl Bench {
                         if scene.is_open(x, y) {
                             let depth = scene.depth_at(x, y);
                             if depth > 0.0 {
-                                let (x, y) = (x as u16, y as u16);
-                                self.spots.push(Spot { x, y, depth });
+                                self.spots.push(Spot {
+                                    x: x as u16,
+                                    y: y as u16,
+                                    depth,
+                                    live: luminance(scene.image.at(x, y).map(f32::from)),
+                                    clean: 0,
+                                    luma: 0.0,
+                                });
                             }
                         }
                     }
@@ -196,10 +217,16 @@ impl Bench {
             let confidences = view.confidence.pixels();
             let depths = view.depth.pixels();
             let [a, b, c, d] = speaker.weights;
-            self.drawn.extend(self.spots.iter().map(|spot| {
+            self.drawn.extend(self.spots.iter_mut().map(|spot| {
+                if spot.is_settled() {
+                    return Drawn::default();
+                }
                 let (x, y) = (f32::from(spot.x), f32::from(spot.y));
                 let (fx, fy) = ((x - left) * pitch, (y - top) * pitch);
                 let loud = (a + (b - a) * fx) * (1.0 - fy) + (c + (d - c) * fx) * fy;
+                if loud <= 0.0 {
+                    return Drawn::default();
+                }
                 let field = scene.grid.between(&fit.field, x, y);
                 let (u, v, depth) = mapping.apply(x + field[part::SHIFT], y + field[part::SHIFT + 1], spot.depth);
                 let loud = loud * field[part::FIT];
@@ -215,9 +242,14 @@ impl Bench {
                     return Drawn::default();
                 }
                 let color = bicubic(&view.image, x0, y0, u - x0 as f32, v - y0 as f32);
+                let color = std::array::from_fn(|c| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS);
+                if least >= CLEAN {
+                    spot.clean += 1;
+                    spot.luma += luminance(color);
+                }
                 let confidence = f32::from(least) / 255.0;
                 Drawn {
-                    color: std::array::from_fn(|c| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS),
+                    color,
                     // Clean sights outshout hazy ones by far more than the confidences alone.
                     weight: loud * confidence * confidence,
                     confidence,

@@ -35,7 +35,7 @@ impl Default for Settings {
             excess_low_levels: 2.0,
             excess_high_levels: 5.0,
             align_on_ring: true,
-            ring_rounds: 3,
+            ring_rounds: 2,
             max_shift_px: 4.0,
             max_ring_levels: 6.0,
             max_ring_share: 0.7,
