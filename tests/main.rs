@@ -12,6 +12,7 @@ mod cli;
 mod color;
 mod config;
 mod determinism;
+mod import;
 mod light_field;
 mod media;
 mod pipeline;

@@ -1,4 +1,4 @@
-//! `light-field`: build from a survey, info, render, evaluate.
+//! `light-field`: build from a survey, import, info, render, evaluate.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::file as camera_file;
+use crate::cli::import;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Rgb8};
@@ -51,6 +52,7 @@ pub struct Args {
 enum Command {
     /// Make a light field from a survey (a recording with camera.yaml, poses and hand_eye.yaml) or from a COLMAP model.
     Build(BuildArgs),
+    Import(import::Args),
     /// Say what a light field holds.
     Info {
         /// The light field's folder.
@@ -123,6 +125,7 @@ struct BuildReport {
 pub fn run(args: &Args, force: bool, progress: &dyn Progress) -> anyhow::Result<()> {
     match &args.command {
         Command::Build(args) => build_command(args, force, progress),
+        Command::Import(args) => import::run(args, force, progress),
         Command::Info { light_field } => info(light_field, progress),
         Command::Render(args) => render(args, force, progress),
         Command::Evaluate { light_field, json } => evaluate(light_field, json.as_deref(), progress),
@@ -329,9 +332,17 @@ fn selected_pictures(recording: &Recording, arm: &Arm, views: usize, progress: &
         Video::Frames(path) => Input::ImageFolder(path.clone()),
     };
     let pool = Pool::<Rgb8>::new(4);
-    let exposed = |number: u64, stamp: Timestamp| match &recording.frame_times {
-        Some(times) => times.get(number as usize).copied(),
-        None => Some(stamp),
+    let exposed = |number: u64, stamp: Timestamp| {
+        match &recording.frame_times {
+        Some(times) => times.get(number as usize).copied().with_context(|| {
+            format!(
+                "frames.csv: expected a line for each frame of the video, found {} lines and a frame {number}; add the missing lines, \
+                 or remove the file to go by the container's time stamps",
+                times.len()
+            )
+        }),
+        None => Ok(stamp),
+    }
     };
     let offset = arm.hand_eye.time_offset.unwrap_or_default();
     let mut reader = VideoReader::open(&input)?;
@@ -342,14 +353,13 @@ fn selected_pictures(recording: &Recording, arm: &Arm, views: usize, progress: &
         if progress.stopping() {
             bail!("stopped before it was done");
         }
-        if let Some(exposed_at) = exposed(frame.number, frame.timestamp) {
-            candidates.push(ViewCandidate {
-                frame_number: frame.number as u32,
-                exposed_at,
-                sharpness: sharpness(&frame.image),
-                world_from_camera: arm.world_from_camera(exposed_at - offset),
-            });
-        }
+        let exposed_at = exposed(frame.number, frame.timestamp)?;
+        candidates.push(ViewCandidate {
+            frame_number: frame.number as u32,
+            exposed_at,
+            sharpness: sharpness(&frame.image),
+            world_from_camera: arm.world_from_camera(exposed_at - offset),
+        });
         progress.advance(1);
     }
     progress.end();
@@ -562,7 +572,8 @@ fn print_report(report: &serde_json::Value) {
     say(&format!("seconds          {}", parts.join(", ")));
 }
 
-fn refuse_overwriting(path: &Path, force: bool) -> anyhow::Result<()> {
+/// Refuse to write over `path` unless told to.
+pub(super) fn refuse_overwriting(path: &Path, force: bool) -> anyhow::Result<()> {
     let occupied = path.is_file() || path.read_dir().is_ok_and(|mut entries| entries.next().is_some());
     if occupied && !force {
         bail!(

@@ -3,6 +3,7 @@
 pub mod console;
 pub mod context;
 pub mod demo;
+pub mod import;
 pub mod light_field;
 pub mod measure;
 pub mod outputs;

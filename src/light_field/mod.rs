@@ -11,6 +11,7 @@ pub mod file;
 pub mod mapping;
 pub mod photometry;
 pub mod ply;
+pub mod pose_list;
 pub mod prior;
 pub mod rasterize;
 pub mod refinement;
