@@ -7,6 +7,7 @@
 )]
 
 mod architecture;
+mod bad_input;
 mod camera;
 mod cli;
 mod color;
