@@ -10,6 +10,7 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use crate::image::{field_of_view, specularity};
+use crate::light_field::prior::PriorSettings;
 use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::{color_normalization, pose_refinement, specularity_substitution, temporal_median, undistortion};
 
@@ -131,6 +132,8 @@ pub struct Config {
     pub specularity: specularity::Settings,
     /// The arm's poses between its samples.
     pub poses: pose_buffer::Settings,
+    /// How far a survey's poses are trusted while a light field is built.
+    pub survey: PriorSettings,
     /// The arm's pose corrected by the picture.
     pub pose_refinement: pose_refinement::Settings,
     /// How specularities are replaced.
@@ -208,6 +211,7 @@ impl Config {
             return Err(format!("undistort.balance: expected 0 to 1, found {balance}"));
         }
         PoseBuffer::new(&self.poses).map(|_| ()).map_err(|error| error.to_string())?;
+        self.survey.check()?;
         // Amounts, reaches and shares: none of them can be negative, and no setting at all can be infinite or no number.
         let tree = Table::try_from(self).map_err(|error| error.to_string())?;
         for (group, settings) in &tree {

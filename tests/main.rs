@@ -7,11 +7,13 @@
 )]
 
 mod architecture;
+mod bad_input;
 mod camera;
 mod cli;
 mod color;
 mod config;
 mod determinism;
+mod import;
 mod light_field;
 mod media;
 mod pipeline;

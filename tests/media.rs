@@ -368,6 +368,12 @@ fn variable_rate(path: &Path, count: usize) -> Vec<i64> {
             "libx264",
             "-video_track_timescale",
             "12800",
+            // Without: ffmpeg 7 writes an edit list that ends before the last frame, which then nobody is to show; and with
+            // B-frames the edit list is what takes their delay off.
+            "-use_editlist",
+            "0",
+            "-bf",
+            "0",
         ],
     );
     (0..count as i64).map(|n| (n + n / 3 + n / 5) * 40_000_000).collect()
@@ -422,7 +428,9 @@ fn probe(path: &Path, stream: &str, entries: &str) -> String {
 fn sound_tags_and_metadata_are_kept() {
     let folder = TempDir::new().unwrap();
     let (silent, path) = (folder.path().join("silent.mp4"), folder.path().join("in.mp4"));
-    let filter = "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p";
+    // Since ffmpeg 7 what the frames say wins over the options, so both say it.
+    let filter = "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p,\
+                  setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv";
     let tags = [
         "-colorspace",
         "bt709",

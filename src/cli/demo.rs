@@ -89,8 +89,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     tracing::info!("2 of 4: building the light field from the survey");
     let began = MonotonicClock.now();
     let light_field_folder = folder.join("light_field");
-    let (light_field, _) =
-        light_field::built(&simulation.join("survey"), VIEWS, true, &context.console).context("building the light field")?;
+    let (light_field, _) = light_field::built(&simulation.join("survey"), VIEWS, true, &context.config, &context.console)
+        .context("building the light field")?;
     light_field_file::save(&light_field, &light_field_folder, &context.console)?;
     drop(light_field);
     parts.light_field_s = since(began);

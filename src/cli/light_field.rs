@@ -1,4 +1,4 @@
-//! `light-field`: build from a survey, info, render, evaluate.
+//! `light-field`: build from a survey, import, info, render, evaluate.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,6 +9,8 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use crate::camera::file as camera_file;
+use crate::cli::import;
+use crate::config::Config;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Rgb8};
@@ -17,6 +19,7 @@ use crate::light_field::build::{self, BuildSettings, CompletionReport};
 use crate::light_field::colmap::model_folder;
 use crate::light_field::evaluate::{Evaluation, leave_one_out};
 use crate::light_field::file;
+use crate::light_field::prior::PriorSettings;
 use crate::light_field::renderer::Renderer;
 use crate::light_field::selection::{SelectionSettings, ViewCandidate, select_views, sharpness};
 use crate::light_field::survey::{self, PosePrior, SurveyFrame};
@@ -28,13 +31,6 @@ use crate::recording::folder::{Recording, Video};
 use crate::robot::hand_eye::HandEye;
 use crate::robot::trajectory::{Trajectory, TumFile};
 use crate::time::{Clock as _, MonotonicClock, Span, Timestamp};
-
-/// An arm whose calibration says nothing is trusted this far, mm.
-const ARM_SIGMA_MM: f64 = 0.5;
-/// An arm whose calibration says nothing is trusted this far, rad.
-const ARM_SIGMA_RAD: f64 = 0.003;
-/// Samples of the arm farther apart are not bridged.
-const MAX_GAP: Span = Span(200_000_000);
 
 /// Light fields: build from a survey, look at, render from, evaluate.
 #[derive(Debug, clap::Args)]
@@ -51,6 +47,7 @@ pub struct Args {
 enum Command {
     /// Make a light field from a survey (a recording with camera.yaml, poses and hand_eye.yaml) or from a COLMAP model.
     Build(BuildArgs),
+    Import(import::Args),
     /// Say what a light field holds.
     Info {
         /// The light field's folder.
@@ -120,9 +117,10 @@ struct BuildReport {
 }
 
 /// Runs one of the subcommands; with `force`, what is there is overwritten.
-pub fn run(args: &Args, force: bool, progress: &dyn Progress) -> anyhow::Result<()> {
+pub fn run(args: &Args, config: &Config, force: bool, progress: &dyn Progress) -> anyhow::Result<()> {
     match &args.command {
-        Command::Build(args) => build_command(args, force, progress),
+        Command::Build(args) => build_command(args, config, force, progress),
+        Command::Import(args) => import::run(args, force, progress),
         Command::Info { light_field } => info(light_field, progress),
         Command::Render(args) => render(args, force, progress),
         Command::Evaluate { light_field, json } => evaluate(light_field, json.as_deref(), progress),
@@ -133,6 +131,9 @@ pub fn run(args: &Args, force: bool, progress: &dyn Progress) -> anyhow::Result<
 struct Arm {
     poses: Trajectory,
     hand_eye: HandEye,
+    /// Samples farther apart are not bridged.
+    max_gap: Span,
+    trust: PriorSettings,
 }
 
 impl PosePrior for Arm {
@@ -141,7 +142,7 @@ impl PosePrior for Arm {
         let next = poses.partition_point(|pose| pose.stamp <= at);
         let (before, after) = (poses.get(next.checked_sub(1)?)?, poses.get(next));
         let hand = match after {
-            Some(after) if (after.stamp - before.stamp) <= MAX_GAP => {
+            Some(after) if (after.stamp - before.stamp) <= self.max_gap => {
                 let t = (at - before.stamp).0 as f64 / (after.stamp - before.stamp).0 as f64;
                 before.base_from_hand.interpolated(&after.base_from_hand, t)
             }
@@ -152,11 +153,11 @@ impl PosePrior for Arm {
     }
 
     fn sigma_mm(&self) -> f64 {
-        ARM_SIGMA_MM
+        self.trust.arm_sigma_mm
     }
 
     fn sigma_rad(&self) -> f64 {
-        ARM_SIGMA_RAD
+        self.trust.arm_sigma_rad
     }
 }
 
@@ -165,19 +166,20 @@ pub fn built(
     source: &Path,
     views: usize,
     refine: bool,
+    config: &Config,
     progress: &dyn Progress,
 ) -> anyhow::Result<(LightField, serde_json::Value)> {
     let (light_field, report) = if model_folder(source).is_some() && !source.join("poses.tum").is_file() {
         from_model(source, progress)?
     } else {
-        from_recording(source, views, refine, progress)?
+        from_recording(source, views, refine, config, progress)?
     };
     Ok((light_field, serde_json::to_value(report)?))
 }
 
-fn build_command(args: &BuildArgs, force: bool, progress: &dyn Progress) -> anyhow::Result<()> {
+fn build_command(args: &BuildArgs, config: &Config, force: bool, progress: &dyn Progress) -> anyhow::Result<()> {
     refuse_overwriting(&args.output, force)?;
-    let (light_field, mut report) = built(&args.recording, args.views, !args.no_refinement, progress)?;
+    let (light_field, mut report) = built(&args.recording, args.views, !args.no_refinement, config, progress)?;
     let began = MonotonicClock.now();
     file::save(&light_field, &args.output, progress)?;
     report["seconds"]["write_s"] = since(began).into();
@@ -220,6 +222,7 @@ fn from_recording(
     source: &Path,
     views: usize,
     refine: bool,
+    config: &Config,
     progress: &dyn Progress,
 ) -> anyhow::Result<(LightField, BuildReport)> {
     let recording = Recording::open(source)?;
@@ -232,6 +235,8 @@ fn from_recording(
     let arm = Arm {
         poses: trajectory.clone(),
         hand_eye: hand_eye.clone(),
+        max_gap: Span::from_milliseconds(config.poses.max_gap_ms),
+        trust: config.survey.clone(),
     };
     let mut seconds = Phases::default();
 
@@ -329,9 +334,17 @@ fn selected_pictures(recording: &Recording, arm: &Arm, views: usize, progress: &
         Video::Frames(path) => Input::ImageFolder(path.clone()),
     };
     let pool = Pool::<Rgb8>::new(4);
-    let exposed = |number: u64, stamp: Timestamp| match &recording.frame_times {
-        Some(times) => times.get(number as usize).copied(),
-        None => Some(stamp),
+    let exposed = |number: u64, stamp: Timestamp| {
+        match &recording.frame_times {
+        Some(times) => times.get(number as usize).copied().with_context(|| {
+            format!(
+                "frames.csv: expected a line for each frame of the video, found {} lines and a frame {number}; add the missing lines, \
+                 or remove the file to go by the container's time stamps",
+                times.len()
+            )
+        }),
+        None => Ok(stamp),
+    }
     };
     let offset = arm.hand_eye.time_offset.unwrap_or_default();
     let mut reader = VideoReader::open(&input)?;
@@ -342,14 +355,13 @@ fn selected_pictures(recording: &Recording, arm: &Arm, views: usize, progress: &
         if progress.stopping() {
             bail!("stopped before it was done");
         }
-        if let Some(exposed_at) = exposed(frame.number, frame.timestamp) {
-            candidates.push(ViewCandidate {
-                frame_number: frame.number as u32,
-                exposed_at,
-                sharpness: sharpness(&frame.image),
-                world_from_camera: arm.world_from_camera(exposed_at - offset),
-            });
-        }
+        let exposed_at = exposed(frame.number, frame.timestamp)?;
+        candidates.push(ViewCandidate {
+            frame_number: frame.number as u32,
+            exposed_at,
+            sharpness: sharpness(&frame.image),
+            world_from_camera: arm.world_from_camera(exposed_at - offset),
+        });
         progress.advance(1);
     }
     progress.end();
@@ -562,7 +574,8 @@ fn print_report(report: &serde_json::Value) {
     say(&format!("seconds          {}", parts.join(", ")));
 }
 
-fn refuse_overwriting(path: &Path, force: bool) -> anyhow::Result<()> {
+/// Refuse to write over `path` unless told to.
+pub(super) fn refuse_overwriting(path: &Path, force: bool) -> anyhow::Result<()> {
     let occupied = path.is_file() || path.read_dir().is_ok_and(|mut entries| entries.next().is_some());
     if occupied && !force {
         bail!(

@@ -3,6 +3,7 @@
 pub mod console;
 pub mod context;
 pub mod demo;
+pub mod import;
 pub mod light_field;
 pub mod measure;
 pub mod outputs;
@@ -111,7 +112,7 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
         Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
-        Command::LightField(args) => light_field::run(&args, context.force, &context.console).map(|()| Ended::Complete),
+        Command::LightField(args) => light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete),
         Command::Simulate(args) => simulate::run(args, context),
     }
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, PoisonError};
 
 use anyhow::{Context as _, bail};
+use tracing::subscriber::NoSubscriber;
 
 use crate::camera::file as camera_file;
 use crate::camera::model::CameraModel;
@@ -12,10 +13,12 @@ use crate::cli::outputs::{Outputs, beside};
 use crate::cli::report::Report;
 use crate::compose::{self, Choice, Equipment, Line};
 use crate::config::Config;
+use crate::frame::PoseOrigin;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::field_of_view;
 use crate::image::pool::Pool;
 use crate::light_field::build::{self as light_field_build, BuildSettings};
+use crate::media::error::MediaError;
 use crate::media::reader::{Input, VideoReader};
 use crate::media::writer::{Output, Sound, VideoWriter, WriterSettings};
 use crate::pipeline::builder::Pipeline;
@@ -25,7 +28,7 @@ use crate::pipeline::stage::Sink;
 use crate::progress::Progress as _;
 use crate::recording::folder::{Recording, Video};
 use crate::sinks::mask::MaskSink;
-use crate::sinks::report::ReportSink;
+use crate::sinks::report::{FrameRecord, ReportSink};
 use crate::sinks::side_by_side::SideBySideSink;
 use crate::sinks::video::VideoSink;
 use crate::sources::recording::{Playback, RecordingSource};
@@ -89,7 +92,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     tracing::debug!("\n{}", report.timing_table());
     tracing::info!(
         "{} of {} frames written to {} in {:.1} s ({:.1} fps, {:.1} ms per frame end to end)",
-        report.frames.left,
+        report.written(),
         report.frames.entered,
         args.output.display(),
         report.seconds,
@@ -135,6 +138,7 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     for part in &left_out {
         tracing::warn!("{part}");
     }
+    let substitutes = stages.iter().any(|stage| stage.name() == "pose_refinement");
 
     let mut writing = WriterSettings::like(&info);
     writing.crf = context.config.output.crf;
@@ -221,6 +225,9 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
         );
     }
     let per_frame = std::mem::take(&mut gathered.lock().unwrap_or_else(PoisonError::into_inner).frames);
+    if let Some(said) = substitutes.then(|| left_alone(&per_frame)).flatten() {
+        tracing::warn!("{said}");
+    }
     let mut report = Report::new(&outcome, seconds, left_out, per_frame);
     report.input = args.input.display().to_string();
     report.output = args.output.display().to_string();
@@ -233,6 +240,19 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
         (true, false) => Ended::Complete,
     };
     Ok(Processed { ended, report })
+}
+
+/// One line on the frames whose specularities were left because the camera's place was not found; `None` when there are none.
+fn left_alone(frames: &[FrameRecord]) -> Option<String> {
+    let lost: Vec<&FrameRecord> = frames.iter().filter(|frame| frame.pose_correction_px.is_none()).collect();
+    let without_pose = lost.iter().filter(|frame| frame.pose == PoseOrigin::Missing).count();
+    let first = lost.first()?.frame;
+    Some(format!(
+        "specular: left as they were on {} of {} frames (the first is {first}): {without_pose} without a pose, {} that do not fit the light field",
+        lost.len(),
+        frames.len(),
+        lost.len() - without_pose
+    ))
 }
 
 fn open_recording(input: &Path) -> anyhow::Result<Recording> {
@@ -250,19 +270,22 @@ fn image_field(input: &Input, span: TimeSpan, config: &Config) -> anyhow::Result
     if *input == Input::Y4mStdin {
         return Ok(None);
     }
-    let mut reader = VideoReader::open(input)?;
-    if let Some(start) = span.start {
-        reader.seek(start)?;
-    }
-    let pool = Pool::new(1);
-    let mut frames = Vec::new();
-    for number in 0..FIELD_FRAMES * FIELD_STEP {
-        // What is wrong with the video is told when it is played.
-        let Ok(Some(frame)) = reader.next_frame(&pool) else { break };
-        if number % FIELD_STEP == 0 {
-            frames.push(frame.image);
+    // What is wrong with the video is told when it is played, and once.
+    let frames = tracing::subscriber::with_default(NoSubscriber::default(), || -> Result<_, MediaError> {
+        let mut reader = VideoReader::open(input)?;
+        if let Some(start) = span.start {
+            reader.seek(start)?;
         }
-    }
+        let pool = Pool::new(1);
+        let mut frames = Vec::new();
+        for number in 0..FIELD_FRAMES * FIELD_STEP {
+            let Ok(Some(frame)) = reader.next_frame(&pool) else { break };
+            if number % FIELD_STEP == 0 {
+                frames.push(frame.image);
+            }
+        }
+        Ok(frames)
+    })?;
     let seen: Vec<&Image<Rgb8>> = frames.iter().map(|frame| &**frame).collect();
     Ok(field_of_view::find(&seen, &config.field_of_view).map(|field| field.mask))
 }

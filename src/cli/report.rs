@@ -141,6 +141,12 @@ impl Report {
         }
     }
 
+    /// Frames that the output took: fewer than came to the line's end when its disk is full.
+    pub fn written(&self) -> u64 {
+        let output = self.sinks.first().map(|sink| sink.working.count);
+        output.unwrap_or(self.frames.left)
+    }
+
     /// Write it as JSON.
     pub fn write(&self, path: &Path) -> anyhow::Result<()> {
         let text = serde_json::to_string_pretty(self)?;

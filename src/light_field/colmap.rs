@@ -73,7 +73,8 @@ const MODELS: [(&str, i32, usize); 7] = [
     ("FULL_OPENCV", 6, 12),
 ];
 
-fn camera_model(name: &str, width: usize, height: usize, p: &[f64]) -> Result<CameraModel, String> {
+/// A camera by COLMAP's model name and parameters.
+pub(crate) fn camera_model(name: &str, width: usize, height: usize, p: &[f64]) -> Result<CameraModel, String> {
     let known = || MODELS.map(|(n, ..)| n).join(", ");
     let &(_, _, count) = MODELS.iter().find(|(n, ..)| *n == name).ok_or_else(|| {
         format!(

@@ -86,7 +86,13 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
     let manifest_path = folder.join("light_field.toml");
     let manifest: Option<Manifest> = if manifest_path.is_file() {
         let text = fs::read_to_string(&manifest_path).map_err(LightFieldError::io(&manifest_path))?;
-        Some(toml::from_str(&text).map_err(|e| LightFieldError::corrupt(&manifest_path, e.to_string()))?)
+        Some(toml::from_str(&text).map_err(|e| {
+            let line = 1 + e
+                .span()
+                .map_or(0, |span| text.get(..span.start).unwrap_or("").matches('\n').count());
+            let what = format!("line {line}: {}; build the light field again", e.message().replace('\n', " "));
+            LightFieldError::corrupt(&manifest_path, what)
+        })?)
     } else {
         tracing::warn!(
             "{}: no light_field.toml; taken as a COLMAP model, its unit as mm",
@@ -384,7 +390,7 @@ fn right_size(path: &Path, (width, height): (usize, usize), camera: &CameraModel
 }
 
 /// The last run of digits in a file's name.
-fn number_in(name: &str) -> Option<u32> {
+pub fn number_in(name: &str) -> Option<u32> {
     let stem = Path::new(name).file_stem()?.to_str()?;
     let end = stem.rfind(|c: char| c.is_ascii_digit())? + 1;
     let start = stem[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |i| i + 1);

@@ -12,6 +12,7 @@ pub mod lamp_share;
 pub mod mapping;
 pub mod photometry;
 pub mod ply;
+pub mod pose_list;
 pub mod prior;
 pub mod rasterize;
 pub mod refinement;

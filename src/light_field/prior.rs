@@ -6,6 +6,40 @@ use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::time::{Span, Timestamp};
 
+/// How far the poses of a survey are trusted before the pictures have spoken.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PriorSettings {
+    /// Standard deviation of a pose's position per axis, mm.
+    pub arm_sigma_mm: f64,
+    /// Standard deviation of a pose's rotation per axis, rad.
+    pub arm_sigma_rad: f64,
+}
+
+impl Default for PriorSettings {
+    fn default() -> Self {
+        Self {
+            arm_sigma_mm: 0.5,
+            arm_sigma_rad: 0.003,
+        }
+    }
+}
+
+impl PriorSettings {
+    /// What is out of bounds: key, value and bound.
+    pub fn check(&self) -> Result<(), String> {
+        for (key, value, low, high) in [
+            ("arm_sigma_mm", self.arm_sigma_mm, 1e-3, 100.0),
+            ("arm_sigma_rad", self.arm_sigma_rad, 1e-5, 1.0),
+        ] {
+            if !(low..=high).contains(&value) {
+                return Err(format!("survey.{key}: expected {low} to {high}, found {value}"));
+            }
+        }
+        Ok(())
+    }
+}
+
 /// The camera's pose by the arm's clock: base_from_hand by time, times hand_from_camera.
 pub trait PosePrior: Sync {
     /// The pose stamped `at` by the arm; `None` where the arm said nothing.

@@ -5,6 +5,7 @@
 //! B-frames, so that decoding order is display order and no time stamp needs shifting. Masks are FFV1; in MP4, which players
 //! expect to hold H.264, they are lossless H.264 in gray, tagged full range, so that every decoder returns the same bytes.
 
+use std::io::{Read as _, Seek as _, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use ffmpeg_next::codec::{self, threading};
@@ -221,7 +222,33 @@ impl ContainerWriter {
             .and_then(|()| self.drain())
             .and_then(|()| self.write_sound(None));
         let ended = flushed.and_then(|()| self.output.write_trailer());
-        ended.map_err(|error| self.fail(error))
+        ended.map_err(|error| self.fail(error))?;
+        if self.frames > 0 && self.lacks_its_end() {
+            self.failed = true;
+            return Err(MediaError::Write {
+                path: self.path.clone(),
+                frames: self.frames,
+                reason: "the end did not come to the disk; is it full?".to_owned(),
+            });
+        }
+        Ok(())
+    }
+
+    /// MP4's muxer does not tell when its last fragment could not be written. Behind that fragment comes the box `mfro` (ISO/IEC
+    /// 14496-12 §8.8.11), 16 bytes that end the file: once a write has failed libav writes no more, so if they are there, all is.
+    fn lacks_its_end(&self) -> bool {
+        let in_fragments = self.path.extension().is_some_and(|e| {
+            let e = e.to_ascii_lowercase();
+            e == "mp4" || e == "mov"
+        });
+        let end = || -> std::io::Result<[u8; 16]> {
+            let mut file = std::fs::File::open(&self.path)?;
+            file.seek(SeekFrom::End(-16))?;
+            let mut end = [0; 16];
+            file.read_exact(&mut end)?;
+            Ok(end)
+        };
+        in_fragments && !end().is_ok_and(|end| &end[4..8] == b"mfro")
     }
 }
 

@@ -1,3 +1,4 @@
+pub mod densify;
 pub mod hand_eye;
 pub mod kinematics;
 pub mod pose_buffer;
