@@ -4,8 +4,10 @@
 const FEWEST_AGREEING: usize = 3;
 /// See [`FEWEST_AGREEING`].
 const AGREEING_SHARE: f32 = 0.08;
-/// At least so many of the darkest answers are looked at.
-const DARKEST: usize = 16;
+/// So large a share of all answers is a crowd …
+const CROWD_SHARE: f32 = 0.4;
+/// … and tight when it differs by at most this.
+const CROWD_SPREAD: f32 = 0.08;
 /// Answers agree when they differ by at most this share.
 const AGREEMENT: f32 = 0.06;
 /// Noise of a colour, share of its brightness.
@@ -35,21 +37,22 @@ impl Tissue {
         self.answers.len()
     }
 
-    /// The mean of the darkest answers that agree with each other; a dark middle one when no few agree.
+    /// The mean of the darkest answers that agree with each other; a dark middle one when no few agree. A tight crowd outvotes a darker
+    /// few: the lamp dazzles every view differently, so what many show alike is tissue, however bright, and the few look past it.
     pub fn color(&mut self) -> [f32; 3] {
         let all = self.answers.len();
-        let enough = FEWEST_AGREEING.max((AGREEING_SHARE * all as f32) as usize);
-        let looked_at = DARKEST.max(all / 3).min(all);
-        if all > looked_at {
-            self.answers.select_nth_unstable_by(looked_at, |a, b| a.0.total_cmp(&b.0));
-        }
-        let darkest = &mut self.answers[..looked_at];
-        darkest.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-        let agreeing = (darkest.windows(enough)).position(|group| group[enough - 1].0 <= (1.0 + AGREEMENT) * group[0].0);
-        let Some(first) = agreeing else {
-            return darkest[looked_at / 3].1;
+        self.answers.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+        let answers = &self.answers[..];
+        let agreeing = |enough: usize, spread: f32| {
+            (answers.windows(enough.max(1))).position(|group| group[group.len() - 1].0 <= (1.0 + spread) * group[0].0)
         };
-        let group = darkest[first..].iter().take_while(|a| a.0 <= (1.0 + AGREEMENT) * darkest[first].0);
+        let few = FEWEST_AGREEING.max((AGREEING_SHARE * all as f32) as usize).min(all);
+        let crowd = (CROWD_SHARE * all as f32) as usize;
+        let crowded = if crowd > few { agreeing(crowd, CROWD_SPREAD) } else { None };
+        let Some(first) = crowded.or_else(|| agreeing(few, AGREEMENT)) else {
+            return answers[all / 8].1;
+        };
+        let group = answers[first..].iter().take_while(|a| a.0 <= (1.0 + AGREEMENT) * answers[first].0);
         let (sum, count) = group.fold(([0.0_f32; 3], 0.0_f32), |(sum, count), (_, color)| {
             (std::array::from_fn(|c| sum[c] + color[c]), count + 1.0)
         });
@@ -109,6 +112,19 @@ mod tests {
         }
         assert_eq!(tissue.answers(), 23);
         assert!((luma(tissue.color()) / luma(TISSUE) - 1.01).abs() < 0.01);
+    }
+
+    #[test]
+    fn a_tight_crowd_is_tissue_however_bright() {
+        let mut tissue = Tissue::default();
+        let white = [210.0, 190.0, 180.0];
+        for i in 0..30 {
+            tissue.hear(white.map(|c| c * (0.99 + 0.0005 * i as f32)));
+        }
+        for _ in 0..6 {
+            tissue.hear(TISSUE);
+        }
+        assert!((luma(tissue.color()) / luma(white) - 1.0).abs() < 0.02);
     }
 
     #[test]

@@ -4,10 +4,11 @@ use crossbeam::queue::ArrayQueue;
 use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Rgb8};
+use crate::light_field::lamp_share::difference;
 use crate::light_field::mapping::Mapping;
 use crate::stages::specularity_substitution::camera_blending::{CameraBlending, Corner};
-use crate::stages::specularity_substitution::grid::CELLS_PER_BLOCK;
-use crate::stages::specularity_substitution::live::{DARK_LEVELS, luminance};
+use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Sums};
+use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live, luminance};
 use crate::stages::specularity_substitution::lookup::{bicubic, is_unoccluded};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
@@ -23,6 +24,49 @@ const BRIGHTER_HALF_LEVELS: f32 = 0.8;
 /// Rounds of that.
 const ROUNDS: usize = 5;
 
+/// A pixel this much darker than what was measured may be noise, levels.
+const NOISE_LEVELS: f32 = 4.0;
+
+/// White light is known to this, levels.
+const WHITE_NOISE_LEVELS: f32 = 2.0;
+/// Where the surface breaks off the views show one thing or the other: so much more evidence is wanted, levels.
+const EDGE_DOUBT_LEVELS: f32 = 25.0;
+/// The surface breaks off where depth changes by this share …
+const EDGE_STEP: f32 = 0.03;
+/// … from this many pixels on one side to as many on the other, in a 960 px wide picture.
+const EDGE_REACH_PX: usize = 4;
+
+/// Tissue is not darker than this share of what lies around it; the gap behind an organ's edge is.
+const DARKEST_SHARE: f32 = 0.5;
+
+/// The mean luma of the good pixels around a spot, levels.
+fn usual(scene: &Scene<'_>, brightness: &[Sums], spot: Spot) -> f32 {
+    let cell = usize::from(spot.y) / scene.grid.cell * scene.grid.across + usize::from(spot.x) / scene.grid.cell;
+    let sums = brightness[cell];
+    (sums[1] / sums[0].max(1e-6) - DARK_LEVELS).max(0.0)
+}
+
+fn is_depth_edge(scene: &Scene<'_>, spot: Spot) -> bool {
+    let (x, y) = (usize::from(spot.x), usize::from(spot.y));
+    let reach = (EDGE_REACH_PX * scene.grid.width).div_ceil(960);
+    let (width, height) = (scene.grid.width, scene.grid.height);
+    let differ = |a: f32, b: f32| (a - b).abs() > EDGE_STEP * spot.depth;
+    differ(
+        scene.depth_at(x.saturating_sub(reach), y),
+        scene.depth_at((x + reach).min(width - 1), y),
+    ) || differ(
+        scene.depth_at(x, y.saturating_sub(reach)),
+        scene.depth_at(x, (y + reach).min(height - 1)),
+    )
+}
+
+/// White light that `live` has and `tissue` has not, levels.
+fn white_light(live: [f32; 3], tissue: [f32; 3]) -> f32 {
+    let dark = |c: f32| c + DARK_LEVELS;
+    let tissue = tissue.map(dark);
+    difference(live.map(dark), tissue).lamp * luminance(tissue)
+}
+
 /// What the light field shows over the holes of a frame; keeps its memory.
 #[derive(Debug)]
 pub struct Canvas {
@@ -32,8 +76,11 @@ pub struct Canvas {
     pub belief: Image<u8>,
     /// The loudest view.
     pub source: Image<u16>,
-    /// How much brighter the live picture is, levels.
+    /// How much brighter the live picture is in white light, levels.
     pub excess: Image<f32>,
+    /// Per cell: by how much the live picture is darker than what was measured, summed over its pixels, levels, and how many these are.
+    /// The lamp never darkens; what does is an edge out of place, a shadow, or a thing that was not there.
+    pub against: Vec<[f32; 2]>,
     benches: ArrayQueue<Box<Bench>>,
 }
 
@@ -44,6 +91,7 @@ impl Default for Canvas {
             belief: Image::filled(0, 0, 0),
             source: Image::filled(0, 0, 0),
             excess: Image::filled(0, 0, 0.0),
+            against: Vec::new(),
             benches: ArrayQueue::new(64),
         }
     }
@@ -55,7 +103,8 @@ struct Spot {
     x: u16,
     y: u16,
     depth: f32,
-    /// Luma of the live pixel, levels.
+    /// The live pixel and its luma, levels.
+    color: Rgb8,
     live: f32,
     /// How many views were heard that saw it clean, and the sum of their luma.
     clean: u16,
@@ -107,7 +156,8 @@ pub struct Chosen<'a> {
 
 impl Canvas {
     /// Draw and blend over all holes of the frame.
-    pub fn draw(&mut self, scene: &Scene<'_>, holes: &[u8], chosen: &Chosen<'_>) {
+    pub fn draw(&mut self, scene: &Scene<'_>, live: &Live, chosen: &Chosen<'_>) {
+        let (holes, brightness) = (&live.holes, &live.detail);
         let (width, height) = scene.image.size();
         self.color.resize(width, height, [0; 3]);
         self.belief.resize(width, height, 0);
@@ -115,12 +165,15 @@ impl Canvas {
         self.excess.resize(width, height, 0.0);
         let rows = scene.grid.block() * width;
         let benches = &self.benches;
+        self.against.clear();
+        self.against.resize(scene.grid.count(), [0.0; 2]);
         (self.color.pixels_mut().par_chunks_mut(rows))
             .zip(self.belief.pixels_mut().par_chunks_mut(rows))
             .zip(self.source.pixels_mut().par_chunks_mut(rows))
             .zip(self.excess.pixels_mut().par_chunks_mut(rows))
+            .zip(self.against.par_chunks_mut(scene.grid.across * CELLS_PER_BLOCK))
             .enumerate()
-            .for_each(|(j, (((color, belief), source), excess))| {
+            .for_each(|(j, ((((color, belief), source), excess), against))| {
                 belief.fill(0);
                 excess.fill(0.0);
                 let mut bench = benches.pop().unwrap_or_default();
@@ -133,12 +186,19 @@ impl Canvas {
                     bench.draw(scene, chosen, i, j);
                     for k in 0..bench.spots.len() {
                         let spot = bench.spots[k];
-                        if let Some((blended, confidence, loudest)) = bench.blended(k) {
-                            let index = (usize::from(spot.y) - j * scene.grid.block()) * width + usize::from(spot.x);
+                        let seen = bench.blended(k).filter(|(blended, ..)| luminance(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
+                        if let Some((blended, confidence, loudest)) = seen {
+                            let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
+                            let index = y * width + x;
                             color[index] = blended.map(|v| (v + 0.5) as u8);
                             belief[index] = (255.0 * confidence).clamp(1.0, 255.0) as u8;
                             source[index] = chosen.fits[bench.speakers[loudest].slot].view as u16;
-                            excess[index] = spot.live - luminance(blended);
+                            let white = white_light(spot.color.map(f32::from), blended) + WHITE_NOISE_LEVELS;
+                            let doubt = if is_depth_edge(scene, spot) { EDGE_DOUBT_LEVELS } else { 0.0 };
+                            excess[index] = white.min(spot.live - luminance(blended)) - doubt;
+                            let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
+                            cell[0] += (luminance(blended) - spot.live - NOISE_LEVELS).max(0.0);
+                            cell[1] += 1.0;
                         }
                     }
                 }
@@ -162,11 +222,13 @@ impl Bench {
                         if scene.is_open(x, y) {
                             let depth = scene.depth_at(x, y);
                             if depth > 0.0 {
+                                let color = scene.image.at(x, y);
                                 self.spots.push(Spot {
                                     x: x as u16,
                                     y: y as u16,
                                     depth,
-                                    live: luminance(scene.image.at(x, y).map(f32::from)),
+                                    color,
+                                    live: luminance(color.map(f32::from)),
                                     clean: 0,
                                     luma: 0.0,
                                 });

@@ -14,6 +14,9 @@ const LEAST_SHARE: f32 = 0.02;
 /// At the end of its reach a replacement wants so much more evidence, levels.
 const FAR_DOUBT_LEVELS: f32 = 4.0;
 
+/// So much more evidence is wanted for every level by which the surroundings are darker than what was measured.
+const AGAINST_WEIGHT: f32 = 2.0;
+
 /// Planes to fill, all of the picture's size.
 #[derive(Debug)]
 pub struct Planes<'a> {
@@ -65,10 +68,24 @@ fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y
     // Noise does not decide: the mean over 3 × 3 pixels.
     let excess = mean_of_neighbours(canvas, x, y).max(0.6 * canvas.excess.at(x, y));
     let near = (1.0 - f32::from(scene.distance.at(x, y)) / f32::from(scene.reach)).clamp(0.0, 1.0);
-    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0);
+    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + AGAINST_WEIGHT * darker_around(scene, canvas, x, y);
     let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
     let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
     smooth(brighter) * smooth((4.0 * near).min(1.0))
+}
+
+/// By how much the pixels around are darker than what was measured, levels, mean over 3 × 3 cells.
+fn darker_around(scene: &Scene<'_>, canvas: &Canvas, x: usize, y: usize) -> f32 {
+    let grid = scene.grid;
+    let (column, row) = (x / grid.cell, y / grid.cell);
+    let (mut sum, mut count) = (0.0_f32, 0.0_f32);
+    for v in row.saturating_sub(1)..(row + 2).min(grid.down) {
+        for cell in &canvas.against[v * grid.across + column.saturating_sub(1)..v * grid.across + (column + 2).min(grid.across)] {
+            sum += cell[0];
+            count += cell[1];
+        }
+    }
+    sum / count.max(1.0)
 }
 
 fn smooth(t: f32) -> f32 {

@@ -155,7 +155,7 @@ impl SpecularitySubstitution {
             slots: &self.slots,
             mappings: &self.mappings,
         };
-        self.canvas.draw(&scene, &self.live.holes, &chosen);
+        self.canvas.draw(&scene, &self.live, &chosen);
         self.out.copy_from(&frame.image);
         let mut provenance = all_left(&self.codes, &self.views, specular);
         let planes = Planes {
