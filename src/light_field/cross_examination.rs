@@ -34,7 +34,8 @@ const DAZZLED_FROM: f32 = 0.13;
 const DAZZLED: f32 = 0.035;
 /// A pixel with this share shows the lamp only.
 const LAMP_ONLY: f32 = 1.5;
-/// A pixel this much darker than the lamp explains shows something else: steel, a shadow, the surround.
+/// A pixel lit this much worse than the lamp explains shows something else: steel, a shadow, the surround (shrunk by the prior: a third
+/// of the light is missing).
 const DARKER: f32 = 0.15;
 /// Below this share noise is averaged away; above it edges are kept.
 const FAINT: f32 = 0.08;

@@ -25,10 +25,10 @@ const BRIGHTER_HALF_LEVELS: f32 = 0.8;
 const ROUNDS: usize = 5;
 
 /// A pixel this much darker than what was measured may be noise, levels.
-const NOISE_LEVELS: f32 = 4.0;
+const NOISE_LEVELS: f32 = 5.0;
 
 /// White light is known to this, levels.
-const WHITE_NOISE_LEVELS: f32 = 2.0;
+const WHITE_NOISE_LEVELS: f32 = 4.0;
 /// Where the surface breaks off the views show one thing or the other: so much more evidence is wanted, levels.
 const EDGE_DOUBT_LEVELS: f32 = 25.0;
 /// The surface breaks off where depth changes by this share …
@@ -58,6 +58,19 @@ fn is_depth_edge(scene: &Scene<'_>, spot: Spot) -> bool {
         scene.depth_at(x, y.saturating_sub(reach)),
         scene.depth_at(x, (y + reach).min(height - 1)),
     )
+}
+
+/// How much more of the lamp's light a spot shows than was measured, levels. What the detector saw need only be brighter; beyond, the
+/// light must be white, and more of it where the surface breaks off.
+fn excess_of(scene: &Scene<'_>, spot: Spot, blended: [f32; 3]) -> f32 {
+    let brighter = spot.live - luminance(blended);
+    let doubt = if is_depth_edge(scene, spot) { EDGE_DOUBT_LEVELS } else { 0.0 };
+    if scene.distance.at(spot.x.into(), spot.y.into()) == 0 {
+        brighter - 0.4 * doubt
+    } else {
+        let white = white_light(spot.color.map(f32::from), blended) + WHITE_NOISE_LEVELS;
+        brighter.min(white) - doubt
+    }
 }
 
 /// White light that `live` has and `tissue` has not, levels.
@@ -186,16 +199,16 @@ impl Canvas {
                     bench.draw(scene, chosen, i, j);
                     for k in 0..bench.spots.len() {
                         let spot = bench.spots[k];
-                        let seen = bench.blended(k).filter(|(blended, ..)| luminance(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
+                        let seen = bench
+                            .blended(k)
+                            .filter(|(blended, ..)| luminance(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
                         if let Some((blended, confidence, loudest)) = seen {
                             let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
                             let index = y * width + x;
                             color[index] = blended.map(|v| (v + 0.5) as u8);
                             belief[index] = (255.0 * confidence).clamp(1.0, 255.0) as u8;
                             source[index] = chosen.fits[bench.speakers[loudest].slot].view as u16;
-                            let white = white_light(spot.color.map(f32::from), blended) + WHITE_NOISE_LEVELS;
-                            let doubt = if is_depth_edge(scene, spot) { EDGE_DOUBT_LEVELS } else { 0.0 };
-                            excess[index] = white.min(spot.live - luminance(blended)) - doubt;
+                            excess[index] = excess_of(scene, spot, blended);
                             let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
                             cell[0] += (luminance(blended) - spot.live - NOISE_LEVELS).max(0.0);
                             cell[1] += 1.0;

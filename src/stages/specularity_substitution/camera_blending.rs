@@ -206,7 +206,11 @@ impl CameraBlending {
         while corner.count < MAX_VIEWS {
             let unseen = wanted[0] & !glimpsed_twice;
             let still_to_be_seen = wanted[0] & could_be_seen != 0 || unseen != 0;
-            let total: f32 = wanted.iter().zip(WORTH_OF_NEXT).map(|(w, worth)| worth * w.count_ones() as f32).sum();
+            let total: f32 = wanted
+                .iter()
+                .zip(WORTH_OF_NEXT)
+                .map(|(w, worth)| worth * w.count_ones() as f32)
+                .sum();
             if total == 0.0 || !still_to_be_seen && corner.count >= ENOUGH_VIEWS {
                 break;
             }
@@ -316,7 +320,11 @@ fn places_around(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> 
 fn world_point(scene: &Scene<'_>, place: Place) -> Vector3<f64> {
     let k = &scene.camera.intrinsics;
     let z = f64::from(place.depth);
-    let point = Point3::new((f64::from(place.x) - k.cx) / k.fx * z, (f64::from(place.y) - k.cy) / k.fy * z, z);
+    let point = Point3::new(
+        (f64::from(place.x) - k.cx) / k.fx * z,
+        (f64::from(place.y) - k.cy) / k.fy * z,
+        z,
+    );
     (scene.eye.isometry() * point).coords
 }
 

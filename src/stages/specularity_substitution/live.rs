@@ -26,6 +26,8 @@ pub struct Live {
     pub pixels: Vec<LivePixel>,
     /// 1 for every cell with a pixel that may be replaced.
     pub holes: Vec<u8>,
+    /// 1 for every cell with good pixels.
+    pub good: Vec<u8>,
     /// Per cell, smoothed: weight, brightness, squared detail (both relative).
     pub detail: Vec<Sums>,
     means: Vec<Sums>,
@@ -69,6 +71,7 @@ impl Live {
             right: grid.across,
             bottom: grid.down,
         };
+        self.good.clear();
         for deviation in [false, true] {
             self.detail.clear();
             for cell in 0..grid.count() {
@@ -86,6 +89,9 @@ impl Live {
                     }
                 }
                 self.detail.push(sums);
+                if !deviation {
+                    self.good.push(u8::from(sums[0] > 0.0));
+                }
             }
             self.smoother.smooth(grid, all, &mut self.detail);
             std::mem::swap(&mut self.means, &mut self.detail);

@@ -9,13 +9,15 @@ use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 
 /// Below this share of the new colour a pixel stays as it was.
-const LEAST_SHARE: f32 = 0.02;
+const LEAST_SHARE: f32 = 0.12;
 
 /// At the end of its reach a replacement wants so much more evidence, levels.
 const FAR_DOUBT_LEVELS: f32 = 4.0;
 
 /// So much more evidence is wanted for every level by which the surroundings are darker than what was measured.
-const AGAINST_WEIGHT: f32 = 2.0;
+const AGAINST_WEIGHT: f32 = 1.5;
+/// The same for what the detector marked.
+const AGAINST_DETECTED: f32 = 0.4;
 
 /// Planes to fill, all of the picture's size.
 #[derive(Debug)]
@@ -68,7 +70,8 @@ fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y
     // Noise does not decide: the mean over 3 × 3 pixels.
     let excess = mean_of_neighbours(canvas, x, y).max(0.6 * canvas.excess.at(x, y));
     let near = (1.0 - f32::from(scene.distance.at(x, y)) / f32::from(scene.reach)).clamp(0.0, 1.0);
-    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + AGAINST_WEIGHT * darker_around(scene, canvas, x, y);
+    let against = if scene.distance.at(x, y) == 0 { AGAINST_DETECTED } else { AGAINST_WEIGHT };
+    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + against * darker_around(scene, canvas, x, y);
     let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
     let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
     smooth(brighter) * smooth((4.0 * near).min(1.0))
@@ -97,7 +100,10 @@ fn mean_of_neighbours(canvas: &Canvas, x: usize, y: usize) -> f32 {
     let (mut sum, mut count) = (0.0, 0.0);
     for v in y.saturating_sub(1)..(y + 2).min(height) {
         let columns = x.saturating_sub(1)..(x + 2).min(width);
-        for (&belief, &excess) in canvas.belief.row(v)[columns.clone()].iter().zip(&canvas.excess.row(v)[columns]) {
+        for (&belief, &excess) in canvas.belief.row(v)[columns.clone()]
+            .iter()
+            .zip(&canvas.excess.row(v)[columns])
+        {
             if belief > 0 {
                 sum += excess;
                 count += 1.0;

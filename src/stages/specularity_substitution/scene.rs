@@ -45,7 +45,10 @@ impl Scene<'_> {
     #[inline]
     pub fn depth_at(&self, x: usize, y: usize) -> f32 {
         let step = self.image.width().div_ceil(self.depth.width()).max(1);
-        let (x, y) = ((x / step).min(self.depth.width() - 1), (y / step).min(self.depth.height() - 1));
+        let (x, y) = (
+            (x / step).min(self.depth.width() - 1),
+            (y / step).min(self.depth.height() - 1),
+        );
         self.depth.at(x, y)
     }
 

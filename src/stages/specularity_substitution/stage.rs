@@ -57,11 +57,7 @@ pub struct SpecularitySubstitution {
 impl SpecularitySubstitution {
     /// With a light field, or without one.
     pub fn new(settings: &Settings, light_field: Option<Arc<LightField>>) -> Self {
-        let small_views = light_field
-            .iter()
-            .flat_map(|field| &field.views)
-            .map(small_copy)
-            .collect();
+        let small_views = light_field.iter().flat_map(|field| &field.views).map(small_copy).collect();
         Self {
             settings: settings.clone(),
             light_field,
@@ -141,8 +137,7 @@ impl SpecularitySubstitution {
             .extend(light_field.views.iter().map(|view| Mapping::new(camera, eye, view)));
         self.blending.choose(&scene, &self.mappings);
         self.live.look(&scene);
-        let count = assign_slots(&scene, &self.blending, &mut self.fits, &mut self.slots);
-        if std::env::var_os("EOF_DEBUG").is_some() { eprintln!("views {count} corners {}", self.blending.corners().iter().filter(|c| !c.voices().is_empty()).count()); }
+        let count = assign_slots(&scene, &self.live, &self.blending, &mut self.fits, &mut self.slots);
         let (live, small_views, mappings, settings) = (&self.live, &self.small_views, &self.mappings, &self.settings);
         self.fits[..count].par_iter_mut().with_max_len(1).for_each(|fit| {
             if let Some(mapping) = &mappings[fit.view] {
@@ -181,7 +176,13 @@ impl SpecularitySubstitution {
 }
 
 /// One fit for every view that speaks anywhere; how many.
-fn assign_slots(scene: &Scene<'_>, blending: &CameraBlending, fits: &mut Vec<ViewFit>, slots: &mut Vec<u16>) -> usize {
+fn assign_slots(
+    scene: &Scene<'_>,
+    live: &Live,
+    blending: &CameraBlending,
+    fits: &mut Vec<ViewFit>,
+    slots: &mut Vec<u16>,
+) -> usize {
     slots.clear();
     slots.resize(scene.light_field.views.len(), NO_SLOT);
     let mut count = 0;
@@ -197,7 +198,7 @@ fn assign_slots(scene: &Scene<'_>, blending: &CameraBlending, fits: &mut Vec<Vie
                 fits[count].begin(voice.view.into(), scene.grid.count());
                 count += 1;
             }
-            fits[usize::from(*slot)].need_around(scene, index % across, index / across);
+            fits[usize::from(*slot)].need_around(scene, live, index % across, index / across);
         }
     }
     count

@@ -27,6 +27,10 @@ const BRIGHTER_AT_MOST: f32 = 4.0;
 const STILL: f32 = 0.12;
 /// Cells around its blocks that a view is looked at, about the width of the ring.
 const CONTEXT_CELLS: usize = 3;
+/// It is looked at farther where fewer cells than this have good pixels …
+const FEWEST_GOOD_CELLS: usize = 24;
+/// … but no farther than this.
+const FARTHEST_CELLS: usize = 16;
 /// Ratios of brightness beyond this are not lighting.
 const MAX_GAIN: f32 = 3.0;
 
@@ -88,16 +92,26 @@ impl ViewFit {
         self.span = Span::default();
     }
 
-    /// The view is needed in the blocks that meet at corner (i, j).
-    pub fn need_around(&mut self, scene: &Scene<'_>, i: usize, j: usize) {
-        let reach = CELLS_PER_BLOCK + CONTEXT_CELLS;
+    /// The view is needed in the blocks that meet at corner (i, j): it is looked at there and as far around as there are good pixels.
+    pub fn need_around(&mut self, scene: &Scene<'_>, live: &Live, i: usize, j: usize) {
         let grid = scene.grid;
-        let span = Span {
+        let around = |reach: usize| Span {
             left: (i * CELLS_PER_BLOCK).saturating_sub(reach),
             top: (j * CELLS_PER_BLOCK).saturating_sub(reach),
             right: (i * CELLS_PER_BLOCK + reach).min(grid.across),
             bottom: (j * CELLS_PER_BLOCK + reach).min(grid.down),
         };
+        let good = |span: Span| -> usize {
+            let count = |row: usize| live.good[span.row(row, grid.across)].iter().filter(|&&g| g != 0).count();
+            span.rows().map(count).sum()
+        };
+        let mut reach = CELLS_PER_BLOCK + CONTEXT_CELLS;
+        let mut span = around(reach);
+        // Deep inside a wide hole nothing good is near.
+        while reach < FARTHEST_CELLS && good(span) < FEWEST_GOOD_CELLS {
+            reach += CONTEXT_CELLS;
+            span = around(reach);
+        }
         for row in span.rows() {
             self.context[span.row(row, grid.across)].fill(1);
         }
@@ -109,7 +123,11 @@ impl ViewFit {
         let cells = scene.grid.count();
         self.field.clear();
         self.field.resize(cells, [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        let rounds = if settings.align_on_ring { settings.ring_rounds.max(1) } else { 1 };
+        let rounds = if settings.align_on_ring {
+            settings.ring_rounds.max(1)
+        } else {
+            1
+        };
         for round in 0..rounds {
             self.draw(scene, live, small, mapping, round > 0);
             self.smoother.smooth(scene.grid, self.span, &mut self.sums);
@@ -162,7 +180,9 @@ impl ViewFit {
                     }
                     let (x0, y0) = (us as usize, vs as usize);
                     let (color, confidence) = bilinear_with_confidence(small, x0, y0, us - x0 as f32, vs - y0 as f32);
-                    if confidence < GOOD_CONFIDENCE || !is_unoccluded(view.depth.at(u.max(0.0) as usize, v.max(0.0) as usize), depth) {
+                    if confidence < GOOD_CONFIDENCE
+                        || !is_unoccluded(view.depth.at(u.max(0.0) as usize, v.max(0.0) as usize), depth)
+                    {
                         continue;
                     }
                     let seen = luminance(color) + DARK_LEVELS;
