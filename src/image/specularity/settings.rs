@@ -39,7 +39,7 @@ impl Default for Settings {
             background_sigma_px: 28.0,
             max_width_px: 44.0,
             whiteness: 0.72,
-            max_region_share: 0.03,
+            max_region_share: 0.012,
             steel_saturation: 0.2,
             steel_min_share: 0.004,
         }

@@ -36,6 +36,11 @@ const EDGE_STEP: f32 = 0.03;
 /// … from this many pixels on one side to as many on the other, in a 960 px wide picture.
 const EDGE_REACH_PX: usize = 4;
 
+/// Views that leave more difference than this around a hole, levels …
+const USUAL_RESIDUAL_LEVELS: f32 = 3.0;
+/// … must show so much more evidence for every level of it.
+const RESIDUAL_WEIGHT: f32 = 3.0;
+
 /// Tissue is not darker than this share of what lies around it; the gap behind an organ's edge is.
 const DARKEST_SHARE: f32 = 0.5;
 
@@ -137,6 +142,7 @@ struct Drawn {
     color: [f32; 3],
     weight: f32,
     confidence: f32,
+    residual: f32,
 }
 
 /// A view's loudness at the four corners of a block.
@@ -202,13 +208,14 @@ impl Canvas {
                         let seen = bench
                             .blended(k)
                             .filter(|(blended, ..)| luminance(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
-                        if let Some((blended, confidence, loudest)) = seen {
+                        if let Some((blended, confidence, residual, loudest)) = seen {
                             let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
                             let index = y * width + x;
                             color[index] = blended.map(|v| (v + 0.5) as u8);
                             belief[index] = (255.0 * confidence).clamp(1.0, 255.0) as u8;
                             source[index] = chosen.fits[bench.speakers[loudest].slot].view as u16;
-                            excess[index] = excess_of(scene, spot, blended);
+                            let unsure = RESIDUAL_WEIGHT * (residual - USUAL_RESIDUAL_LEVELS).max(0.0);
+                            excess[index] = excess_of(scene, spot, blended) - unsure;
                             let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
                             cell[0] += (luminance(blended) - spot.live - NOISE_LEVELS).max(0.0);
                             cell[1] += 1.0;
@@ -328,19 +335,20 @@ impl Bench {
                     // Clean sights outshout hazy ones by far more than the confidences alone.
                     weight: loud * confidence * confidence,
                     confidence,
+                    residual: field[part::RESIDUAL],
                 }
             }));
         }
     }
 
-    /// Colour, confidence and the loudest speaker for spot `k`; `None` when nobody saw it.
-    fn blended(&self, k: usize) -> Option<([f32; 3], f32, usize)> {
+    /// Colour, confidence, what difference its views leave around the hole (levels) and the loudest speaker for spot `k`; `None` when nobody saw it.
+    fn blended(&self, k: usize) -> Option<([f32; 3], f32, f32, usize)> {
         let count = self.spots.len();
         let drawn = || (0..self.speakers.len()).map(|s| &self.drawn[s * count + k]);
         let mut reference = f32::INFINITY;
         let mut result = None;
         for _ in 0..=ROUNDS {
-            let (mut sum, mut total, mut confidence) = ([0.0_f32; 3], 0.0_f32, 0.0_f32);
+            let (mut sum, mut total, mut confidence, mut residual) = ([0.0_f32; 3], 0.0_f32, 0.0_f32, 0.0_f32);
             let mut loudest = (0.0_f32, 0);
             for (index, view) in drawn().enumerate() {
                 let brighter = (luminance(view.color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
@@ -350,6 +358,7 @@ impl Bench {
                 }
                 total += weight;
                 confidence += weight * view.confidence;
+                residual += weight * view.residual;
                 if weight > loudest.0 {
                     loudest = (weight, index);
                 }
@@ -359,7 +368,7 @@ impl Bench {
             }
             let color = sum.map(|s| (s / total).clamp(0.0, 255.0));
             reference = luminance(color);
-            result = Some((color, confidence / total, loudest.1));
+            result = Some((color, confidence / total, residual / total, loudest.1));
         }
         result
     }

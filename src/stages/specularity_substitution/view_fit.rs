@@ -42,6 +42,8 @@ pub mod part {
     pub const SHIFT: usize = 3;
     /// How well the view fits, 0…1.
     pub const FIT: usize = 5;
+    /// What difference is left around the hole, root mean square, levels.
+    pub const RESIDUAL: usize = 6;
 }
 
 /// A view's fields; keeps its memory.
@@ -275,6 +277,7 @@ impl ViewFit {
                 let (difference, brightness) = ((sums[5] / sums[6]).sqrt(), detail[1] / detail[0]);
                 let own = (detail[2] / detail[0]).sqrt();
                 let bound = (settings.max_ring_levels / brightness).max(settings.max_ring_share * own);
+                field[part::RESIDUAL] = difference * brightness;
                 (2.0 - difference / bound).clamp(0.0, 1.0)
             } else {
                 0.0
