@@ -1,21 +1,9 @@
 //! What a user meets at the command line: exit codes and messages.
 
 use std::path::Path;
-use std::process::{Command, Output};
 
+use crate::support::command::{endofield, told};
 use endofield::image::buffer::Image;
-
-fn endofield(arguments: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_endofield"))
-        .args(arguments)
-        .current_dir(folder)
-        .output()
-        .unwrap()
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
 
 /// A folder of small pictures with a bright square that wanders.
 fn pictures(folder: &Path, count: usize) {
@@ -69,7 +57,7 @@ fn bad_usage_is_2() {
     ];
     for arguments in wrong {
         let output = endofield(arguments, folder.path());
-        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", stderr(&output));
+        assert_eq!(output.status.code(), Some(2), "{arguments:?}: {}", told(&output));
     }
     assert!(!folder.path().join("out").exists());
 }
@@ -78,7 +66,7 @@ fn bad_usage_is_2() {
 fn the_settings_are_printed_without_an_input() {
     let folder = tempfile::tempdir().unwrap();
     let output = endofield(&["process", "--set", "output.crf=33", "--print-config"], folder.path());
-    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert_eq!(output.status.code(), Some(0), "{}", told(&output));
     assert!(String::from_utf8_lossy(&output.stdout).contains("crf = 33"));
 }
 
@@ -99,12 +87,12 @@ fn pictures_go_through_the_line_and_the_report_tells() {
         "report.json",
     ];
     let output = endofield(&arguments, folder.path());
-    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert_eq!(output.status.code(), Some(0), "{}", told(&output));
     let count = |name: &str| std::fs::read_dir(folder.path().join(name)).unwrap().count();
     assert_eq!((count("out"), count("mask"), count("both")), (7, 7, 7));
-    let told = stderr(&output);
-    assert_eq!(told.lines().filter(|line| line.contains("undistort:")).count(), 1, "{told}");
-    assert_eq!(told.lines().filter(|line| line.contains("specular:")).count(), 1, "{told}");
+    let said = told(&output);
+    assert_eq!(said.lines().filter(|line| line.contains("undistort:")).count(), 1, "{said}");
+    assert_eq!(said.lines().filter(|line| line.contains("specular:")).count(), 1, "{said}");
     let text = std::fs::read_to_string(folder.path().join("report.json")).unwrap();
     let report: serde_json::Value = serde_json::from_str(&text).unwrap();
     assert_eq!(
@@ -119,7 +107,7 @@ fn pictures_go_through_the_line_and_the_report_tells() {
 
     let again = endofield(&arguments, folder.path());
     assert_eq!(again.status.code(), Some(1));
-    assert!(stderr(&again).contains("--force"), "{}", stderr(&again));
+    assert!(told(&again).contains("--force"), "{}", told(&again));
     let forced: Vec<&str> = arguments.iter().copied().chain(["--force"]).collect();
     assert_eq!(endofield(&forced, folder.path()).status.code(), Some(0));
 }
@@ -130,9 +118,9 @@ fn the_input_is_never_the_output() {
     pictures(&folder.path().join("in"), 2);
     let output = endofield(&["process", "in", "-o", "in/", "--force"], folder.path());
     assert_eq!(output.status.code(), Some(1));
-    assert!(stderr(&output).contains("input"), "{}", stderr(&output));
+    assert!(told(&output).contains("input"), "{}", told(&output));
     let twice = endofield(&["process", "in", "-o", "out.mkv", "--mask-out", "out.mkv"], folder.path());
-    assert_eq!(twice.status.code(), Some(2), "{}", stderr(&twice));
+    assert_eq!(twice.status.code(), Some(2), "{}", told(&twice));
 }
 
 #[test]
@@ -143,13 +131,13 @@ fn what_is_no_video_is_refused_with_a_message() {
     put("text.mp4", "this is no video\n");
     for input in ["empty.mp4", "text.mp4", "absent.mp4"] {
         let output = endofield(&["process", input, "-o", "out.mkv"], folder.path());
-        assert_eq!(output.status.code(), Some(1), "{input}: {}", stderr(&output));
+        assert_eq!(output.status.code(), Some(1), "{input}: {}", told(&output));
         assert!(
-            stderr(&output).starts_with("error: ") && stderr(&output).contains(input),
+            told(&output).starts_with("error: ") && told(&output).contains(input),
             "{}",
-            stderr(&output)
+            told(&output)
         );
-        assert!(!stderr(&output).contains("panicked"));
+        assert!(!told(&output).contains("panicked"));
     }
     assert!(!folder.path().join("out.mkv").exists());
 }
@@ -162,8 +150,8 @@ fn progress_for_machines_is_json() {
         &["process", "in", "-o", "out/", "--progress", "json", "--log-format", "json"],
         folder.path(),
     );
-    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
-    let told = stderr(&output);
+    assert_eq!(output.status.code(), Some(0), "{}", told(&output));
+    let told = told(&output);
     for line in told.lines() {
         assert!(serde_json::from_str::<serde_json::Value>(line).is_ok(), "not JSON: {line}");
     }

@@ -3,8 +3,8 @@
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
-use std::process::{Command, Output};
 
+use crate::support::command::{endofield, told};
 use endofield::robot::trajectory::TumFile;
 
 /// Length of a unit of the model, mm.
@@ -12,17 +12,9 @@ const UNIT_MM: f64 = 2.5;
 /// Every so many frames have a pose.
 const STEP: usize = 4;
 
-fn endofield(arguments: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_endofield"))
-        .args(arguments)
-        .current_dir(folder)
-        .output()
-        .unwrap()
-}
-
 fn succeeded(arguments: &[&str], folder: &Path) -> String {
     let output = endofield(arguments, folder);
-    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    let told = told(&output);
     assert_eq!(output.status.code(), Some(0), "{arguments:?}: {told}");
     told
 }

@@ -20,6 +20,12 @@ pub struct Lab {
 /// White of sRGB, D65, Y = 1.
 const WHITE: [f64; 3] = [0.950_470, 1.0, 1.088_830];
 
+/// Rec. 601 luma, in the unit of the channels.
+#[inline]
+pub fn luma([r, g, b]: [f32; 3]) -> f32 {
+    0.299 * r + 0.587 * g + 0.114 * b
+}
+
 /// Linear light 0 to 1 from an encoded value 0 to 1.
 pub fn linear_from_srgb(encoded: f64) -> f64 {
     if encoded <= 0.040_45 {

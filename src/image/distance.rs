@@ -11,10 +11,12 @@ pub const UNITS_PER_PX: u16 = 3;
 const DIAGONAL: u16 = 4;
 
 /// So many pixels before a stretch are looked at with it.
-const CONTEXT: usize = 64;
+const CONTEXT: usize = 96;
 /// Pixels of a row treated at a time.
 const STRETCH: usize = 448;
 const BUFFER: usize = CONTEXT + STRETCH;
+/// Six rounds of doubling hand a distance on to the 63 px beside it; the 64th is at this limit.
+const SIX_ROUNDS_LIMIT: u16 = 64 * UNITS_PER_PX;
 /// What is farther than the context is beyond this limit.
 const LARGEST_FAST_LIMIT: u16 = CONTEXT as u16 * UNITS_PER_PX;
 
@@ -125,7 +127,13 @@ impl Pass {
             onto_right::<8>(b, a);
             onto_right::<16>(a, b);
             onto_right::<32>(b, a);
-            row[begin..end].copy_from_slice(&a[CONTEXT..CONTEXT + end - begin]);
+            let result = if self.limit > SIX_ROUNDS_LIMIT {
+                onto_right::<64>(a, b);
+                b
+            } else {
+                a
+            };
+            row[begin..end].copy_from_slice(&result[CONTEXT..CONTEXT + end - begin]);
         }
     }
 
@@ -153,7 +161,13 @@ impl Pass {
                 onto_left::<8>(b, a);
                 onto_left::<16>(a, b);
                 onto_left::<32>(b, a);
-                row[begin..end].copy_from_slice(&a[..end - begin]);
+                let result = if self.limit > SIX_ROUNDS_LIMIT {
+                    onto_left::<64>(a, b);
+                    b
+                } else {
+                    a
+                };
+                row[begin..end].copy_from_slice(&result[..end - begin]);
             }
             end = begin;
         }
@@ -222,6 +236,10 @@ mod tests {
             (450, 25, 55, 5),
             (1, 40, 30, 2),
             (900, 3, 192, 1),
+            (900, 3, 193, 1),
+            (1920, 5, 241, 3),
+            (1100, 4, 288, 2),
+            (600, 4, 289, 2),
             (70, 60, 500, 3),
             (30, 20, 55, 0),
         ] {

@@ -13,7 +13,7 @@ use crate::image::buffer::{Image, Mask};
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 use crate::image::hole_filling::HoleFiller;
 use crate::light_field::lamp_share::{Tissue, difference};
-use crate::light_field::mapping::Mapping;
+use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::{LampShading, LightField, View};
 
 /// Pixels along a square that is judged as one.
@@ -41,8 +41,6 @@ const DARKER: f32 = 0.15;
 const FAINT: f32 = 0.08;
 /// Added to both sides, levels: in the dark ratios are noise.
 const DARK_LEVELS: f32 = 8.0;
-/// Views disagree in depth by at most this share.
-const OCCLUSION_TOLERANCE: f32 = 0.03;
 /// Depth is carried into holes over about 2 to this power, px.
 const DEPTH_REACH_LEVELS: usize = 6;
 /// Exposure and lamp are smooth: held for squares of this many pixels along a side.
@@ -271,11 +269,8 @@ impl<'a> Witness<'a> {
             return None;
         }
         let (column, row) = ((u + 0.5) as usize, (v + 0.5) as usize);
-        let held = self.view.depth.at(column, row);
-        if held > 0.0 && (held - depth).abs() > OCCLUSION_TOLERANCE * depth {
-            return None;
-        }
-        Some(self.shade.common(self.view.image.at(column, row).map(f32::from), column, row))
+        is_unoccluded(self.view.depth.at(column, row), depth)
+            .then(|| self.shade.common(self.view.image.at(column, row).map(f32::from), column, row))
     }
 }
 

@@ -1,5 +1,7 @@
 //! How much of a colour is the lamp's, given what other views show of the same place.
 
+use crate::image::color::luma;
+
 /// So many answers, and this share of all, must agree to be the tissue's: most of the witnesses may be dazzled themselves.
 const FEWEST_AGREEING: usize = 3;
 /// See [`FEWEST_AGREEING`].
@@ -91,10 +93,6 @@ pub fn difference(color: [f32; 3], tissue: [f32; 3]) -> Difference {
         lamp: (tt * wr - tw * tr) / determinant,
         lit: (ww * tr - tw * wr) / determinant,
     }
-}
-
-fn luma([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
 }
 
 #[cfg(test)]

@@ -36,3 +36,22 @@ impl Mapping {
         (row(0) * inverse, row(1) * inverse, depth)
     }
 }
+
+/// Relative difference of depth beyond which a view sees something else.
+const OCCLUSION_TOLERANCE: f32 = 0.03;
+
+/// True if a surface seen at depth `held` is what lies at depth `asked`; an unknown depth hides nothing.
+#[inline]
+pub fn is_unoccluded(held: f32, asked: f32) -> bool {
+    held <= 0.0 || (held - asked).abs() <= OCCLUSION_TOLERANCE * asked
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn depth_tells_what_hides() {
+        assert!(is_unoccluded(0.0, 80.0) && is_unoccluded(79.0, 80.0) && !is_unoccluded(70.0, 80.0));
+    }
+}

@@ -14,6 +14,7 @@ use crate::geometry::point::Point;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::color::luma;
 use crate::synthetic::airborne::{AIRLIGHT, Smoke, Streak, streaks};
 use crate::synthetic::instrument::{InstrumentHit, Rod, grasper, instrument_hit, unshaded};
 use crate::synthetic::light::{Facing, Lamp, Radiance, steel_radiance, tissue_radiance};
@@ -593,10 +594,6 @@ impl<'a> View<'a> {
     }
 }
 
-/// Rec. 601 luma.
-fn luma(colour: [f32; 3]) -> f32 {
-    0.299 * colour[0] + 0.587 * colour[1] + 0.114 * colour[2]
-}
 
 /// The lens's blur: a 3×3 binomial-like kernel, in place.
 pub(super) fn soften(light: &mut [[f32; 3]], width: usize) {

@@ -1,4 +1,5 @@
 //! What the integration tests share.
 
+pub mod command;
 pub mod line;
 pub mod scene;

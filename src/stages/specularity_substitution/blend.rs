@@ -4,12 +4,13 @@ use crossbeam::queue::ArrayQueue;
 use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Rgb8};
+use crate::image::color::luma;
 use crate::light_field::lamp_share::difference;
-use crate::light_field::mapping::Mapping;
+use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::stages::specularity_substitution::camera_blending::{CameraBlending, Corner};
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Sums};
-use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live, luminance};
-use crate::stages::specularity_substitution::lookup::{bicubic, is_unoccluded};
+use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
+use crate::stages::specularity_substitution::lookup::bicubic;
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
 
@@ -31,10 +32,12 @@ const NOISE_LEVELS: f32 = 5.0;
 const WHITE_NOISE_LEVELS: f32 = 4.0;
 /// Where the surface breaks off the views show one thing or the other: so much more evidence is wanted, levels.
 const EDGE_DOUBT_LEVELS: f32 = 25.0;
+/// The same for what the detector marked.
+const EDGE_DOUBT_DETECTED_LEVELS: f32 = 10.0;
 /// The surface breaks off where depth changes by this share …
 const EDGE_STEP: f32 = 0.03;
 /// … from this many pixels on one side to as many on the other, in a 960 px wide picture.
-const EDGE_REACH_PX: usize = 4;
+const EDGE_REACH_PX: f32 = 4.0;
 
 /// Views that leave more difference than this around a hole, levels …
 const USUAL_RESIDUAL_LEVELS: f32 = 3.0;
@@ -53,7 +56,7 @@ fn usual(scene: &Scene<'_>, brightness: &[Sums], spot: Spot) -> f32 {
 
 fn is_depth_edge(scene: &Scene<'_>, spot: Spot) -> bool {
     let (x, y) = (usize::from(spot.x), usize::from(spot.y));
-    let reach = (EDGE_REACH_PX * scene.grid.width).div_ceil(960);
+    let reach = (EDGE_REACH_PX * scene.scale).ceil() as usize;
     let (width, height) = (scene.grid.width, scene.grid.height);
     let differ = |a: f32, b: f32| (a - b).abs() > EDGE_STEP * spot.depth;
     differ(
@@ -68,21 +71,21 @@ fn is_depth_edge(scene: &Scene<'_>, spot: Spot) -> bool {
 /// How much more of the lamp's light a spot shows than was measured, levels. What the detector saw need only be brighter; beyond, the
 /// light must be white, and more of it where the surface breaks off.
 fn excess_of(scene: &Scene<'_>, spot: Spot, blended: [f32; 3]) -> f32 {
-    let brighter = spot.live - luminance(blended);
-    let doubt = if is_depth_edge(scene, spot) { EDGE_DOUBT_LEVELS } else { 0.0 };
-    if scene.distance.at(spot.x.into(), spot.y.into()) == 0 {
-        brighter - 0.4 * doubt
+    let brighter = spot.live - luma(blended);
+    let (excess, doubt) = if scene.distance.at(spot.x.into(), spot.y.into()) == 0 {
+        (brighter, EDGE_DOUBT_DETECTED_LEVELS)
     } else {
         let white = white_light(spot.color.map(f32::from), blended) + WHITE_NOISE_LEVELS;
-        brighter.min(white) - doubt
-    }
+        (brighter.min(white), EDGE_DOUBT_LEVELS)
+    };
+    if is_depth_edge(scene, spot) { excess - doubt } else { excess }
 }
 
 /// White light that `live` has and `tissue` has not, levels.
 fn white_light(live: [f32; 3], tissue: [f32; 3]) -> f32 {
     let dark = |c: f32| c + DARK_LEVELS;
     let tissue = tissue.map(dark);
-    difference(live.map(dark), tissue).lamp * luminance(tissue)
+    difference(live.map(dark), tissue).lamp * luma(tissue)
 }
 
 /// What the light field shows over the holes of a frame; keeps its memory.
@@ -207,7 +210,7 @@ impl Canvas {
                         let spot = bench.spots[k];
                         let seen = bench
                             .blended(k)
-                            .filter(|(blended, ..)| luminance(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
+                            .filter(|(blended, ..)| luma(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
                         if let Some((blended, confidence, residual, loudest)) = seen {
                             let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
                             let index = y * width + x;
@@ -217,7 +220,7 @@ impl Canvas {
                             let unsure = RESIDUAL_WEIGHT * (residual - USUAL_RESIDUAL_LEVELS).max(0.0);
                             excess[index] = excess_of(scene, spot, blended) - unsure;
                             let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
-                            cell[0] += (luminance(blended) - spot.live - NOISE_LEVELS).max(0.0);
+                            cell[0] += (luma(blended) - spot.live - NOISE_LEVELS).max(0.0);
                             cell[1] += 1.0;
                         }
                     }
@@ -248,7 +251,7 @@ impl Bench {
                                     y: y as u16,
                                     depth,
                                     color,
-                                    live: luminance(color.map(f32::from)),
+                                    live: luma(color.map(f32::from)),
                                     clean: 0,
                                     luma: 0.0,
                                 });
@@ -327,7 +330,7 @@ impl Bench {
                 let color = std::array::from_fn(|c| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS);
                 if least >= CLEAN {
                     spot.clean += 1;
-                    spot.luma += luminance(color);
+                    spot.luma += luma(color);
                 }
                 let confidence = f32::from(least) / 255.0;
                 Drawn {
@@ -351,7 +354,7 @@ impl Bench {
             let (mut sum, mut total, mut confidence, mut residual) = ([0.0_f32; 3], 0.0_f32, 0.0_f32, 0.0_f32);
             let mut loudest = (0.0_f32, 0);
             for (index, view) in drawn().enumerate() {
-                let brighter = (luminance(view.color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
+                let brighter = (luma(view.color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
                 let weight = view.weight / (1.0 + brighter * brighter);
                 for (sum, channel) in sum.iter_mut().zip(view.color) {
                     *sum += weight * channel;
@@ -367,7 +370,7 @@ impl Bench {
                 return None;
             }
             let color = sum.map(|s| (s / total).clamp(0.0, 255.0));
-            reference = luminance(color);
+            reference = luma(color);
             result = Some((color, confidence / total, residual / total, loudest.1));
         }
         result

@@ -7,10 +7,9 @@ use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 use crate::camera::model::CameraModel;
-use crate::light_field::mapping::Mapping;
+use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid};
-use crate::stages::specularity_substitution::lookup::is_unoccluded;
 use crate::stages::specularity_substitution::scene::Scene;
 
 /// At most so many views speak at a corner.

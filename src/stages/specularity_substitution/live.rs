@@ -2,6 +2,7 @@
 
 use rayon::prelude::*;
 
+use crate::image::color::luma;
 use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_CELL, Smoother, Span, Sums};
 use crate::stages::specularity_substitution::scene::Scene;
 
@@ -32,12 +33,6 @@ pub struct Live {
     pub detail: Vec<Sums>,
     means: Vec<Sums>,
     smoother: Smoother,
-}
-
-/// Luma, levels.
-#[inline]
-pub fn luminance([r, g, b]: [f32; 3]) -> f32 {
-    0.299 * r + 0.587 * g + 0.114 * b
 }
 
 impl Live {
@@ -134,7 +129,7 @@ fn look_at_row(scene: &Scene<'_>, row: usize, pixels: &mut [LivePixel], holes: &
         }
         let count = (step * step) as f32;
         pixel.color = sum.map(|s| s as f32 / count);
-        pixel.brightness = luminance(pixel.color) + DARK_LEVELS;
+        pixel.brightness = luma(pixel.color) + DARK_LEVELS;
         if pixel.color.iter().any(|&c| c < 250.0) {
             pixel.depth = scene.depth_at(x, y);
         }

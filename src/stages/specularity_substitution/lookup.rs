@@ -2,15 +2,6 @@
 
 use crate::image::buffer::{Image, Rgb8};
 
-/// Relative difference of depth beyond which a view sees something else.
-const OCCLUSION_TOLERANCE: f32 = 0.03;
-
-/// True if a surface seen at depth `held` is what lies at depth `asked`; an unknown depth hides nothing.
-#[inline]
-pub fn is_unoccluded(held: f32, asked: f32) -> bool {
-    held <= 0.0 || (held - asked).abs() <= OCCLUSION_TOLERANCE * asked
-}
-
 /// Catmull and Rom's cubic (Keys 1981, a = −½), which keeps the tissue's texture; `x`, `y` at least 1 and 2 from the far borders.
 #[inline]
 pub fn bicubic(image: &Image<Rgb8>, x: usize, y: usize, fx: f32, fy: f32) -> [f32; 3] {
@@ -75,10 +66,5 @@ mod tests {
         assert!((color[0] - 43.0).abs() < 1e-3 && (color[1] - 67.2).abs() < 1e-3 && (color[2] - 77.0).abs() < 1e-3);
         let (color, confidence) = bilinear_with_confidence(&small, 4, 5, 0.3, 0.6);
         assert!((color[0] - 43.0).abs() < 1e-3 && (color[1] - 67.2).abs() < 1e-3 && confidence == 104);
-    }
-
-    #[test]
-    fn depth_tells_what_hides() {
-        assert!(is_unoccluded(0.0, 80.0) && is_unoccluded(79.0, 80.0) && !is_unoccluded(70.0, 80.0));
     }
 }

@@ -70,7 +70,11 @@ fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y
     // Noise does not decide: the mean over 3 × 3 pixels.
     let excess = mean_of_neighbours(canvas, x, y).max(0.6 * canvas.excess.at(x, y));
     let near = (1.0 - f32::from(scene.distance.at(x, y)) / f32::from(scene.reach)).clamp(0.0, 1.0);
-    let against = if scene.distance.at(x, y) == 0 { AGAINST_DETECTED } else { AGAINST_WEIGHT };
+    let against = if scene.distance.at(x, y) == 0 {
+        AGAINST_DETECTED
+    } else {
+        AGAINST_WEIGHT
+    };
     let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + against * darker_around(scene, canvas, x, y);
     let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
     let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);

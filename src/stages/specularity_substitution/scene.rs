@@ -25,6 +25,10 @@ pub struct Scene<'a> {
     pub camera: &'a CameraModel,
     /// Where it was taken.
     pub eye: &'a Transform<World, Camera>,
+    /// Picture pixels along a pixel of `depth`.
+    pub depth_step: usize,
+    /// Width of the picture over the width for which lengths are given.
+    pub scale: f32,
     /// The frame's cells.
     pub grid: Grid,
     /// How far replacement reaches, the ring begins and the ring ends, in units of distance.
@@ -44,12 +48,8 @@ impl Scene<'_> {
     /// Depth at a pixel, mm; 0 where unknown.
     #[inline]
     pub fn depth_at(&self, x: usize, y: usize) -> f32 {
-        let step = self.image.width().div_ceil(self.depth.width()).max(1);
-        let (x, y) = (
-            (x / step).min(self.depth.width() - 1),
-            (y / step).min(self.depth.height() - 1),
-        );
-        self.depth.at(x, y)
+        let (x, y) = (x / self.depth_step, y / self.depth_step);
+        self.depth.at(x.min(self.depth.width() - 1), y.min(self.depth.height() - 1))
     }
 
     /// True where a pixel may be replaced.

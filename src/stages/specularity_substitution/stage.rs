@@ -28,6 +28,11 @@ use crate::stages::specularity_substitution::view_fit::{ViewFit, small_copy};
 const DEPTH_REACH_LEVELS: usize = 6;
 /// Widest picture over which depth is drawn pixel for pixel.
 const DEPTH_WIDTH_PX: usize = 960;
+/// Picture pixels along a pixel of the depth's picture.
+fn depth_step(width: usize) -> usize {
+    width.div_ceil(DEPTH_WIDTH_PX).max(1)
+}
+
 /// No place among the fits.
 const NO_SLOT: u16 = u16::MAX;
 
@@ -57,7 +62,9 @@ pub struct SpecularitySubstitution {
 impl SpecularitySubstitution {
     /// With a light field, or without one.
     pub fn new(settings: &Settings, light_field: Option<Arc<LightField>>) -> Self {
-        let small_views = light_field.iter().flat_map(|field| &field.views).map(small_copy).collect();
+        let small_views = light_field
+            .as_ref()
+            .map_or_else(Vec::new, |field| field.views.par_iter().map(small_copy).collect());
         Self {
             settings: settings.clone(),
             light_field,
@@ -82,7 +89,7 @@ impl SpecularitySubstitution {
 
     fn draw_depth(&mut self, light_field: &LightField, frame: &Frame, camera: &CameraModel) {
         let Some(pose) = &frame.world_from_camera else { return };
-        let step = camera.width.div_ceil(DEPTH_WIDTH_PX).max(1);
+        let step = depth_step(camera.width);
         let coarse = self.coarse_camera.get_or_insert_with(|| camera.scaled(1.0 / step as f64));
         if coarse.width != camera.width / step {
             *coarse = camera.scaled(1.0 / step as f64);
@@ -127,6 +134,8 @@ impl SpecularitySubstitution {
             forbidden: &self.forbidden,
             camera,
             eye,
+            depth_step: depth_step(camera.width),
+            scale,
             grid: Grid::over(specular.size()),
             reach,
             guard: Scene::distance_of(self.settings.guard_px * scale),

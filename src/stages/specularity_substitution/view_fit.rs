@@ -5,11 +5,12 @@
 //! around zero, because a ring without texture must not invent a shift; the fit is what difference remains.
 
 use crate::image::buffer::Image;
-use crate::light_field::mapping::Mapping;
+use crate::image::color::luma;
+use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, SMALL_PER_CELL, Smoother, Span, Sums, step_for};
-use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live, luminance};
-use crate::stages::specularity_substitution::lookup::{bilinear_with_confidence, is_unoccluded};
+use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
+use crate::stages::specularity_substitution::lookup::bilinear_with_confidence;
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 
@@ -125,12 +126,7 @@ impl ViewFit {
         let cells = scene.grid.count();
         self.field.clear();
         self.field.resize(cells, [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-        let rounds = if settings.align_on_ring {
-            settings.ring_rounds.max(1)
-        } else {
-            1
-        };
-        for round in 0..rounds {
+        for round in 0..settings.ring_rounds.max(1) {
             self.draw(scene, live, small, mapping, round > 0);
             self.smoother.smooth(scene.grid, self.span, &mut self.sums);
             self.match_brightness();
@@ -140,8 +136,7 @@ impl ViewFit {
             if !settings.align_on_ring {
                 break;
             }
-            let limit = settings.max_shift_px * scene.image.width() as f32 / 960.0;
-            if self.shift(scene.grid.step as f32, limit) < STILL && round > 0 {
+            if self.shift(scene.grid.step as f32, settings.max_shift_px * scene.scale) < STILL && round > 0 {
                 break;
             }
         }
@@ -187,7 +182,7 @@ impl ViewFit {
                     {
                         continue;
                     }
-                    let seen = luminance(color) + DARK_LEVELS;
+                    let seen = luma(color) + DARK_LEVELS;
                     self.brightness[index] = seen;
                     let weight = if again {
                         let residual = pixel.brightness / (gain * seen) - 1.0;
@@ -331,5 +326,5 @@ fn between(cells: &[[f32; 3]; 3], x: usize, y: usize) -> f32 {
 }
 
 fn mean_gain(field: &Sums) -> f32 {
-    luminance([field[part::GAIN], field[part::GAIN + 1], field[part::GAIN + 2]])
+    luma([field[part::GAIN], field[part::GAIN + 1], field[part::GAIN + 2]])
 }
