@@ -22,6 +22,8 @@ pub(super) struct Bounds {
     pub halo: Image<f32>,
     /// In darkest − whiteness · brightest, to be white light.
     pub white: Image<f32>,
+    /// The same with a core's whiteness.
+    pub core_white: Image<f32>,
 }
 
 /// Working memory.
@@ -33,6 +35,8 @@ pub(super) struct Background {
     most: Image<f32>,
     spread: Image<f32>,
     opened: Image<f32>,
+    /// The same for a core, which is narrower.
+    core_opened: Image<f32>,
     /// The result.
     pub bounds: Bounds,
 }
@@ -47,10 +51,12 @@ impl Background {
             most: empty(),
             spread: empty(),
             opened: empty(),
+            core_opened: empty(),
             bounds: Bounds {
                 core: empty(),
                 halo: empty(),
                 white: empty(),
+                core_white: empty(),
             },
         }
     }
@@ -101,30 +107,42 @@ impl Background {
 
     /// Opening: erosion, then dilation, by squares; invalid cells take no part in the erosion.
     fn open(&mut self, settings: &Settings, cells: &Cells, cells_per_px: f32) {
-        let radius = (0.5 * settings.max_width_px * cells_per_px).round().max(1.0) as usize;
-        self.opened.copy_from(&cells.least);
-        for (opened, valid) in self.opened.pixels_mut().iter_mut().zip(cells.valid.pixels()) {
-            *opened = if *valid != 0 { *opened } else { 255.0 };
+        for (opened, width_px) in [
+            (&mut self.opened, settings.max_width_px),
+            (&mut self.core_opened, settings.core_max_width_px),
+        ] {
+            let radius = (0.5 * width_px * cells_per_px).round().max(1.0) as usize;
+            opened.copy_from(&cells.least);
+            for (opened, valid) in opened.pixels_mut().iter_mut().zip(cells.valid.pixels()) {
+                *opened = if *valid != 0 { *opened } else { 255.0 };
+            }
+            // The blurred weight is not needed any more.
+            extreme_over_square(opened, radius, f32::min, 255.0, &mut self.blurred_weight);
+            extreme_over_square(opened, radius, f32::max, 0.0, &mut self.blurred_weight);
         }
-        // The blurred weight is not needed any more.
-        extreme_over_square(&mut self.opened, radius, f32::min, 255.0, &mut self.blurred_weight);
-        extreme_over_square(&mut self.opened, radius, f32::max, 0.0, &mut self.blurred_weight);
     }
 
     fn set_bounds(&mut self, settings: &Settings, brightness: f32) {
-        let core_levels = settings.core_levels * brightness;
-        let halo_levels = settings.halo_levels * brightness;
-        let Bounds { core, halo, white } = &mut self.bounds;
-        for bound in [&mut *core, &mut *halo, &mut *white] {
-            bound.copy_from(&self.least);
-        }
-        let bounds = core.pixels_mut().iter_mut().zip(halo.pixels_mut()).zip(white.pixels_mut());
-        let found = self.opened.pixels().iter().zip(self.spread.pixels()).zip(self.most.pixels());
-        for (((core, halo), white), ((opened, spread), most)) in bounds.zip(found) {
-            let base = core.max(*opened);
-            *core = base + core_levels.max(CORE_SPREADS * spread);
-            *halo = base + halo_levels.max(HALO_SPREADS * spread);
-            *white -= settings.whiteness * most;
+        let spread = &self.spread;
+        let beyond = |bound: &mut Image<f32>, mean: &Image<f32>, opened: &Image<f32>, levels: f32, spreads: f32| {
+            bound.copy_from(mean);
+            let found = opened.pixels().iter().zip(spread.pixels());
+            for (bound, (opened, spread)) in bound.pixels_mut().iter_mut().zip(found) {
+                *bound = bound.max(*opened) + levels.max(spreads * spread);
+            }
+        };
+        let bounds = &mut self.bounds;
+        let (core, halo) = (settings.core_levels * brightness, settings.halo_levels * brightness);
+        beyond(&mut bounds.core, &self.least, &self.core_opened, core, CORE_SPREADS);
+        beyond(&mut bounds.halo, &self.least, &self.opened, halo, HALO_SPREADS);
+        for (white, whiteness) in [
+            (&mut bounds.white, settings.whiteness),
+            (&mut bounds.core_white, settings.core_whiteness),
+        ] {
+            white.copy_from(&self.least);
+            for (white, most) in white.pixels_mut().iter_mut().zip(self.most.pixels()) {
+                *white -= whiteness * most;
+            }
         }
     }
 }

@@ -26,6 +26,8 @@ pub(super) struct Rules<'a> {
     pub step: usize,
     /// See [`Settings::whiteness`](crate::image::specularity::Settings::whiteness).
     pub whiteness: f32,
+    /// See [`Settings::core_whiteness`](crate::image::specularity::Settings::core_whiteness).
+    pub core_whiteness: f32,
 }
 
 /// Holds pixels against bounds; owns its working memory.
@@ -33,8 +35,8 @@ pub(super) struct Rules<'a> {
 pub(super) struct Classifier {
     /// For each pixel right of a cell's centre, how far it is on the way to the next.
     between: Vec<f32>,
-    /// Per row of cells the bounds at every pixel column: core, halo, white.
-    along: Vec<[Vec<f32>; 3]>,
+    /// Per row of cells the bounds at every pixel column: core, halo, white, white of a core.
+    along: Vec<[Vec<f32>; 4]>,
 }
 
 impl Classifier {
@@ -58,7 +60,7 @@ impl Classifier {
                 top: &along[top],
                 bottom: &along[(top + 1).min(cells_down - 1)],
                 part: place.fract(),
-                whiteness: rules.whiteness,
+                whiteness: [rules.whiteness, rules.core_whiteness],
                 cores,
                 halos,
             });
@@ -85,9 +87,15 @@ impl Classifier {
         self.between.clear();
         self.between
             .extend((0..step).map(|column| (column as f32 + first) / step as f32));
-        self.along.resize_with(cells_down, <[Vec<f32>; 3]>::default);
+        self.along.resize_with(cells_down, <[Vec<f32>; 4]>::default);
         let between = &self.between;
-        let bounds = [&rules.bounds.core, &rules.bounds.halo, &rules.bounds.white];
+        let Bounds {
+            core,
+            halo,
+            white,
+            core_white,
+        } = rules.bounds;
+        let bounds = [core, halo, white, core_white];
         self.along.par_iter_mut().enumerate().for_each(|(row, along)| {
             for (out, bound) in along.iter_mut().zip(bounds) {
                 out.resize(width, 0.0);
@@ -111,11 +119,12 @@ struct PixelRow<'a> {
     least: &'a [u8],
     most: &'a [u8],
     /// Bounds along the rows of cells above and below.
-    top: &'a [Vec<f32>; 3],
-    bottom: &'a [Vec<f32>; 3],
+    top: &'a [Vec<f32>; 4],
+    bottom: &'a [Vec<f32>; 4],
     /// How far from the one to the other.
     part: f32,
-    whiteness: f32,
+    /// Of halos, of cores.
+    whiteness: [f32; 2],
     cores: &'a mut [u8],
     halos: &'a mut [u8],
 }
@@ -153,7 +162,7 @@ impl PixelRow<'_> {
             self.cores[at..].first_chunk_mut::<N>(),
             self.halos[at..].first_chunk_mut::<N>(),
         );
-        let (Some(core), Some(halo), Some(white)) = (bounds(0), bounds(1), bounds(2)) else {
+        let (Some(core), Some(halo), Some(white), Some(core_white)) = (bounds(0), bounds(1), bounds(2), bounds(3)) else {
             return;
         };
         let ((Some(least), Some(most)), (Some(cores), Some(halos))) = (levels, out) else {
@@ -167,9 +176,10 @@ impl PixelRow<'_> {
             let bound = |(top, bottom): (&[f32; N], &[f32; N])| top[i] + (bottom[i] - top[i]) * part;
             let (value, brightest) = (f32::from(least[i]), f32::from(most[i]));
             // By how much each demand is met.
-            let white = value - whiteness * brightest - bound(white);
+            let white = value - whiteness[0] * brightest - bound(white);
+            let core_white = value - whiteness[1] * brightest - bound(core_white);
             let clipped = value - (CLIPPED_LEVEL - 0.5);
-            cores[i] = met(higher(clipped, lower(white, value - bound(core))));
+            cores[i] = met(higher(clipped, lower(core_white, value - bound(core))));
             halos[i] = met(higher(clipped, lower(white, value - bound(halo))));
         }
     }
@@ -197,9 +207,15 @@ mod tests {
         let free = rules.steel.at(cell.0, cell.1) == 0 && rules.field.is_none_or(|field| field.at(x, y) != 0);
         let (least, most) = (extremes.least[y * width + x], extremes.most[y * width + x]);
         let value = f32::from(least);
-        let white = value - rules.whiteness * f32::from(most) >= bound(&rules.bounds.white);
-        let beyond = |limit: f32| free && (least >= 250 || white && value > limit);
-        (beyond(bound(&rules.bounds.core)), beyond(bound(&rules.bounds.halo)))
+        let white = |share: f32, limit: f32| value - share * f32::from(most) >= limit;
+        let beyond = |limit: f32, white: bool| free && (least >= 250 || white && value > limit);
+        (
+            beyond(
+                bound(&rules.bounds.core),
+                white(rules.core_whiteness, bound(&rules.bounds.core_white)),
+            ),
+            beyond(bound(&rules.bounds.halo), white(rules.whiteness, bound(&rules.bounds.white))),
+        )
     }
 
     #[test]
@@ -228,6 +244,7 @@ mod tests {
                 core: bound(100, 240),
                 halo: bound(80, 200),
                 white: bound(-60, 0),
+                core_white: bound(-90, 0),
             };
             let mut steel = Image::filled(cells.0, cells.1, 0);
             steel.set(cells.0 - 1, 1, 255);
@@ -239,6 +256,7 @@ mod tests {
                 field: Some(&field),
                 step,
                 whiteness: 0.72,
+                core_whiteness: 1.0,
             };
             let (mut cores, mut halos) = (Image::filled(width, height, 7), Image::filled(width, height, 7));
             Classifier::default().classify(&extremes, &rules, &mut cores, &mut halos);

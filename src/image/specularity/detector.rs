@@ -79,6 +79,7 @@ impl SpecularityDetector {
             field,
             step,
             whiteness: self.settings.whiteness,
+            core_whiteness: self.settings.core_whiteness,
         };
         self.classifier
             .classify(&self.extremes, &rules, &mut self.cores, &mut self.halos);

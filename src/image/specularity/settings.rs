@@ -20,8 +20,12 @@ pub struct Settings {
     pub background_sigma_px: f32,
     /// Bright things wider than this are background, unless clipped, px at 960 px width.
     pub max_width_px: f32,
+    /// The same for cores, which are narrower, px at 960 px width.
+    pub core_max_width_px: f32,
     /// The darkest channel rises at least this much of what the brightest does.
     pub whiteness: f32,
+    /// The same for cores: light added to tissue, in coded levels, lifts the dark channel more than the bright one.
+    pub core_whiteness: f32,
     /// Regions beyond this share of the picture are specular only if a good part of them is clipped.
     pub max_region_share: f32,
     /// Steel: (max − min)/max of the channels is below this.
@@ -38,7 +42,9 @@ impl Default for Settings {
             halo_reach_px: 9.0,
             background_sigma_px: 28.0,
             max_width_px: 44.0,
+            core_max_width_px: 36.0,
             whiteness: 0.72,
+            core_whiteness: 1.0,
             max_region_share: 0.012,
             steel_saturation: 0.2,
             steel_min_share: 0.004,

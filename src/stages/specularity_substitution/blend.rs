@@ -44,6 +44,14 @@ const USUAL_RESIDUAL_LEVELS: f32 = 3.0;
 /// … must show so much more evidence for every level of it.
 const RESIDUAL_WEIGHT: f32 = 3.0;
 
+/// Views agree with the blend within this, levels, and this share of its luma.
+const AGREEMENT_LEVELS: f32 = 5.0;
+const AGREEMENT_SHARE: f32 = 0.05;
+/// Tissue looks the same to most views; steel, a mirror, to none. Where less than this share of the votes agrees …
+const USUAL_AGREEMENT: f32 = 0.7;
+/// … so much more evidence is wanted, all of it where none does, levels.
+const DISAGREEMENT_LEVELS: f32 = 90.0;
+
 /// Tissue is not darker than this share of what lies around it; the gap behind an organ's edge is.
 const DARKEST_SHARE: f32 = 0.5;
 
@@ -211,13 +219,12 @@ impl Canvas {
                         let seen = bench
                             .blended(k)
                             .filter(|(blended, ..)| luma(*blended) > DARKEST_SHARE * usual(scene, brightness, spot));
-                        if let Some((blended, confidence, residual, loudest)) = seen {
+                        if let Some((blended, confidence, unsure, loudest)) = seen {
                             let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
                             let index = y * width + x;
                             color[index] = blended.map(|v| (v + 0.5) as u8);
                             belief[index] = (255.0 * confidence).clamp(1.0, 255.0) as u8;
                             source[index] = chosen.fits[bench.speakers[loudest].slot].view as u16;
-                            let unsure = RESIDUAL_WEIGHT * (residual - USUAL_RESIDUAL_LEVELS).max(0.0);
                             excess[index] = excess_of(scene, spot, blended) - unsure;
                             let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
                             cell[0] += (luma(blended) - spot.live - NOISE_LEVELS).max(0.0);
@@ -344,7 +351,8 @@ impl Bench {
         }
     }
 
-    /// Colour, confidence, what difference its views leave around the hole (levels) and the loudest speaker for spot `k`; `None` when nobody saw it.
+    /// Colour, confidence, how much more evidence is wanted for what its views leave open (levels) and the loudest speaker for spot `k`;
+    /// `None` when nobody saw it.
     fn blended(&self, k: usize) -> Option<([f32; 3], f32, f32, usize)> {
         let count = self.spots.len();
         let drawn = || (0..self.speakers.len()).map(|s| &self.drawn[s * count + k]);
@@ -352,6 +360,13 @@ impl Bench {
         let mut result = None;
         for _ in 0..=ROUNDS {
             let (mut sum, mut total, mut confidence, mut residual) = ([0.0_f32; 3], 0.0_f32, 0.0_f32, 0.0_f32);
+            let (mut agreed, mut heard) = (0.0_f32, 0.0_f32);
+            let tolerance = AGREEMENT_LEVELS
+                + if reference.is_finite() {
+                    AGREEMENT_SHARE * reference
+                } else {
+                    0.0
+                };
             let mut loudest = (0.0_f32, 0);
             for (index, view) in drawn().enumerate() {
                 let brighter = (luma(view.color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
@@ -360,6 +375,10 @@ impl Bench {
                     *sum += weight * channel;
                 }
                 total += weight;
+                heard += view.weight;
+                if (luma(view.color) - reference).abs() < tolerance {
+                    agreed += view.weight;
+                }
                 confidence += weight * view.confidence;
                 residual += weight * view.residual;
                 if weight > loudest.0 {
@@ -371,7 +390,9 @@ impl Bench {
             }
             let color = sum.map(|s| (s / total).clamp(0.0, 255.0));
             reference = luma(color);
-            result = Some((color, confidence / total, residual / total, loudest.1));
+            let unsure = RESIDUAL_WEIGHT * (residual / total - USUAL_RESIDUAL_LEVELS).max(0.0)
+                + DISAGREEMENT_LEVELS * (USUAL_AGREEMENT - agreed / heard).max(0.0);
+            result = Some((color, confidence / total, unsure, loudest.1));
         }
         result
     }

@@ -23,4 +23,5 @@ pub mod replacement;
 pub mod scene;
 pub mod settings;
 pub mod stage;
+pub mod support;
 pub mod view_fit;

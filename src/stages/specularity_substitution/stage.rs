@@ -22,6 +22,7 @@ use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::replacement::{Planes, replace};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
+use crate::stages::specularity_substitution::support::Support;
 use crate::stages::specularity_substitution::view_fit::{ViewFit, small_copy};
 
 /// Depth is carried into holes over about 2 to this power, px of the depth's picture.
@@ -44,6 +45,7 @@ pub struct SpecularitySubstitution {
     small_views: Vec<Image<[u8; 4]>>,
     rasterizer: DepthRasterizer,
     filler: HoleFiller,
+    support: Support,
     depth: Image<f32>,
     coarse_camera: Option<CameraModel>,
     distance: Image<u16>,
@@ -71,6 +73,7 @@ impl SpecularitySubstitution {
             small_views,
             rasterizer: DepthRasterizer::new(),
             filler: HoleFiller::default(),
+            support: Support::default(),
             depth: Image::filled(0, 0, 0.0),
             coarse_camera: None,
             distance: Image::filled(0, 0, 0),
@@ -97,7 +100,9 @@ impl SpecularitySubstitution {
         self.rasterizer.render(&light_field.surface, coarse, pose, &mut self.depth);
         // The survey's stereo is blind under its own specularities: there the surface is taken to go on smoothly. Only the place is
         // guessed so, not the colour, and a wrong place shows on the ring.
+        self.support.learn(&self.depth);
         self.filler.fill(&mut self.depth, DEPTH_REACH_LEVELS);
+        self.support.restrict(&mut self.depth);
     }
 
     /// Where nothing may be touched or learnt.
