@@ -112,7 +112,9 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
         Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
-        Command::LightField(args) => light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete),
+        Command::LightField(args) => {
+            light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete)
+        }
         Command::Simulate(args) => simulate::run(args, context),
     }
 }

@@ -594,7 +594,6 @@ impl<'a> View<'a> {
     }
 }
 
-
 /// The lens's blur: a 3×3 binomial-like kernel, in place.
 pub(super) fn soften(light: &mut [[f32; 3]], width: usize) {
     /// Share of a pixel's light that falls on each of its neighbours along an axis.
