@@ -7,7 +7,7 @@ use crate::image::buffer::{Image, Rgb8};
 use crate::image::color::luma;
 use crate::light_field::lamp_share::difference;
 use crate::stages::specularity_substitution::drawing::{Bench, Chosen, Spot};
-use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Sums};
+use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, Sums};
 use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
 use crate::stages::specularity_substitution::scene::Scene;
 
@@ -73,20 +73,25 @@ fn white_light(live: [f32; 3], tissue: [f32; 3]) -> f32 {
     difference(live.map(dark), tissue).lamp * luma(tissue)
 }
 
+/// Belief of a pixel that was not drawn, as it is no brighter than what was measured.
+pub const PLAIN: u8 = 1;
+
 /// What the light field shows over the holes of a frame; keeps its memory.
 #[derive(Debug)]
 pub struct Canvas {
-    /// Colours; only where `belief` is above zero.
+    /// Colours; only where `belief` is above [`PLAIN`].
     pub color: Image<Rgb8>,
     /// How sure, 0–255; 0 where nothing is known.
     pub belief: Image<u8>,
     /// The loudest view.
     pub source: Image<u16>,
-    /// How much brighter the live picture is in white light, levels.
+    /// How much brighter the live picture is in white light, levels; only where `belief` is above zero.
     pub excess: Image<f32>,
-    /// Per cell: by how much the live picture is darker than what was measured, summed over its pixels, levels, and how many these are.
-    /// The lamp never darkens; what does is an edge out of place, a shadow, or a thing that was not there.
-    pub against: Vec<[f32; 2]>,
+    /// Per cell: by how much the live picture is darker than what was measured, levels, mean over 3 × 3 cells. The lamp never darkens;
+    /// what does is an edge out of place, a shadow, or a thing that was not there.
+    pub against: Vec<f32>,
+    /// Per cell: the same summed over its pixels, and how many these are.
+    darker: Vec<[f32; 2]>,
     benches: ArrayQueue<Bench>,
 }
 
@@ -98,6 +103,7 @@ impl Default for Canvas {
             source: Image::filled(0, 0, 0),
             excess: Image::filled(0, 0, 0.0),
             against: Vec::new(),
+            darker: Vec::new(),
             benches: ArrayQueue::new(64),
         }
     }
@@ -116,13 +122,13 @@ impl Canvas {
         }
         let rows = scene.grid.block() * width;
         let benches = &self.benches;
-        self.against.clear();
-        self.against.resize(scene.grid.count(), [0.0; 2]);
+        self.darker.clear();
+        self.darker.resize(scene.grid.count(), [0.0; 2]);
         (self.color.pixels_mut().par_chunks_mut(rows))
             .zip(self.belief.pixels_mut().par_chunks_mut(rows))
             .zip(self.source.pixels_mut().par_chunks_mut(rows))
             .zip(self.excess.pixels_mut().par_chunks_mut(rows))
-            .zip(self.against.par_chunks_mut(scene.grid.across * CELLS_PER_BLOCK))
+            .zip(self.darker.par_chunks_mut(scene.grid.across * CELLS_PER_BLOCK))
             .enumerate()
             .for_each(|(j, ((((color, belief), source), excess), against))| {
                 belief.fill(0);
@@ -131,9 +137,19 @@ impl Canvas {
                 for i in (0..across).filter(|i| live.hole_blocks[j * across + i] != 0) {
                     bench.blend(scene, holes, chosen, i, j);
                     for plain in &bench.plain {
-                        let cell = &mut against[plain.cell - j * CELLS_PER_BLOCK * scene.grid.across];
-                        cell[0] += plain.count * (plain.darker - NOISE_LEVELS).max(0.0);
-                        cell[1] += plain.count;
+                        let (top, step) = (plain.top - j * scene.grid.block(), scene.grid.step);
+                        for (y, live) in (top..top + step).zip(plain.top..) {
+                            let columns = plain.left..plain.left + step;
+                            let index = y * width + plain.left;
+                            belief[index..index + step].fill(PLAIN);
+                            for (excess, pixel) in excess[index..].iter_mut().zip(&scene.image.row(live)[columns]) {
+                                *excess = luma(pixel.map(f32::from)) - plain.expected;
+                            }
+                        }
+                        let cell = &mut against[top / scene.grid.cell * scene.grid.across + plain.left / scene.grid.cell];
+                        let count = (step * step) as f32;
+                        cell[0] += count * (plain.darker - NOISE_LEVELS).max(0.0);
+                        cell[1] += count;
                     }
                     for (spot, blended) in bench.blended() {
                         let brightness = luma(blended.color);
@@ -143,7 +159,7 @@ impl Canvas {
                         let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
                         let index = y * width + x;
                         color[index] = blended.color.map(|v| (v + 0.5) as u8);
-                        belief[index] = (255.0 * blended.confidence).clamp(1.0, 255.0) as u8;
+                        belief[index] = (255.0 * blended.confidence).clamp(f32::from(PLAIN) + 1.0, 255.0) as u8;
                         source[index] = blended.view as u16;
                         let unsure = RESIDUAL_WEIGHT * (blended.residual - USUAL_RESIDUAL_LEVELS).max(0.0);
                         excess[index] = excess_of(scene, spot, blended.color) - unsure;
@@ -155,5 +171,24 @@ impl Canvas {
                 // More benches than the queue holds are simply freed.
                 let _surplus = benches.push(bench);
             });
+        self.average_darker(scene.grid, holes);
+    }
+
+    /// Fill `against`.
+    fn average_darker(&mut self, grid: Grid, holes: &[u8]) {
+        self.against.clear();
+        self.against.resize(grid.count(), 0.0);
+        for (cell, against) in self.against.iter_mut().enumerate().filter(|(cell, _)| holes[*cell] != 0) {
+            let (column, row) = (cell % grid.across, cell / grid.across);
+            let (mut sum, mut count) = (0.0_f32, 0.0_f32);
+            for v in row.saturating_sub(1)..(row + 2).min(grid.down) {
+                let begin = v * grid.across;
+                for darker in &self.darker[begin + column.saturating_sub(1)..begin + (column + 2).min(grid.across)] {
+                    sum += darker[0];
+                    count += darker[1];
+                }
+            }
+            *against = sum / count.max(1.0);
+        }
     }
 }

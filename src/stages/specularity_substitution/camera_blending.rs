@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::stages::specularity_substitution::ensemble::{Ensemble, MOST_MEMBERS};
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid};
 use crate::stages::specularity_substitution::scene::Scene;
-use crate::stages::specularity_substitution::sight::{Place, Sight, Vantage};
+use crate::stages::specularity_substitution::sight::{Place, Sight, Views};
 
 /// At most so many views speak at a corner.
 pub const MAX_VIEWS: usize = 8;
@@ -48,6 +48,8 @@ pub struct Voice {
 pub struct Corner {
     voices: [Voice; MAX_VIEWS],
     count: usize,
+    /// A bit for every member of the ensemble that speaks.
+    members: u64,
 }
 
 impl Corner {
@@ -56,8 +58,8 @@ impl Corner {
         &self.voices[..self.count]
     }
 
-    fn speaks(&self, view: u16) -> bool {
-        self.voices().iter().any(|v| v.view == view)
+    fn has(&self, member: usize) -> bool {
+        self.members >> member & 1 != 0
     }
 }
 
@@ -93,26 +95,26 @@ impl CameraBlending {
         self.ensemble.forget();
     }
 
-    /// Choose for the frame, at most `limit` views in all. `vantages` holds one entry a view, `None` where it cannot see the frame.
+    /// Choose for the frame, at most `limit` views in all; `holes` is 1 for every cell with a pixel that may be replaced.
     ///
     /// The lamp's image moves little between neighbouring views, so the best views by angle are often dazzled at the very place that is
     /// asked for: views are taken one by one, each for its angle and for the places that too few of those before it saw.
-    pub fn choose(&mut self, scene: &Scene<'_>, vantages: &[Option<Vantage>], limit: usize) {
-        self.find_places(scene);
-        self.ensemble.gather(scene, vantages, &self.samples, limit);
-        self.look(scene, vantages);
+    pub fn choose(&mut self, scene: &Scene<'_>, holes: &[u8], views: &Views<'_>, limit: usize) {
+        self.find_places(scene, holes);
+        self.ensemble.gather(views, &self.samples, limit);
+        self.look(views);
         let (across, down) = scene.grid.blocks();
         self.corners.clear();
         for j in 0..=down {
             for i in 0..=across {
-                let corner = self.choose_at(scene, vantages, i, j);
+                let corner = self.choose_at(scene.grid, views, i, j);
                 self.corners.push(corner);
             }
         }
     }
 
     /// A pixel for every quarter of a cell with a hole: the specular one nearest to the quarter's middle, else the one nearest to the mask.
-    fn find_places(&mut self, scene: &Scene<'_>) {
+    fn find_places(&mut self, scene: &Scene<'_>, holes: &[u8]) {
         let grid = scene.grid;
         self.places.clear();
         self.places.resize(grid.count() * PLACES_PER_CELL, Place::default());
@@ -123,6 +125,9 @@ impl CameraBlending {
                 for (index, place) in places.iter_mut().enumerate() {
                     let half = grid.cell / 2;
                     let (column, quarter) = (index / PLACES_PER_CELL, index % PLACES_PER_CELL);
+                    if holes[row * grid.across + column] == 0 {
+                        continue;
+                    }
                     let (left, top) = (column * grid.cell + quarter % 2 * half, row * grid.cell + quarter / 2 * half);
                     *place = place_in(scene, left, top, half);
                 }
@@ -138,7 +143,7 @@ impl CameraBlending {
     }
 
     /// How every member sees every place.
-    fn look(&mut self, scene: &Scene<'_>, vantages: &[Option<Vantage>]) {
+    fn look(&mut self, views: &Views<'_>) {
         let members = self.ensemble.members();
         self.sights.clear();
         self.sights.resize(self.places.len() * members.len(), Sight::Unseen);
@@ -149,37 +154,33 @@ impl CameraBlending {
             .for_each(|(sights, place)| {
                 if place.depth > 0.0 {
                     for (sight, &view) in sights.iter_mut().zip(members) {
-                        if let Some(vantage) = &vantages[usize::from(view)] {
-                            *sight = vantage.sight(&scene.light_field.views[usize::from(view)], *place);
-                        }
+                        *sight = views.sight(view, *place);
                     }
                 }
             });
     }
 
-    fn choose_at(&self, scene: &Scene<'_>, vantages: &[Option<Vantage>], i: usize, j: usize) -> Corner {
+    fn choose_at(&self, grid: Grid, views: &Views<'_>, i: usize, j: usize) -> Corner {
         let mut corner = Corner::default();
-        let grid = scene.grid;
         let holes = gather(grid, i, j, &self.places);
         if holes.count == 0 {
             return corner;
         }
         let places = &holes.index[..holes.count];
         let across = Self::corners_across(grid);
-        let neighbours = [
-            (i > 0).then(|| &self.corners[j * across + i - 1]),
-            (j > 0).then(|| &self.corners[(j - 1) * across + i]),
-            (i > 0 && j > 0).then(|| &self.corners[(j - 1) * across + i - 1]),
-            (j > 0 && i + 1 < across).then(|| &self.corners[(j - 1) * across + i + 1]),
+        let before = [
+            (i > 0).then(|| j * across + i - 1),
+            (j > 0).then(|| (j - 1) * across + i),
+            (i > 0 && j > 0).then(|| (j - 1) * across + i - 1),
+            (j > 0 && i + 1 < across).then(|| (j - 1) * across + i + 1),
         ];
+        let company = (before.into_iter().flatten()).fold(0, |all, corner| all | self.corners[corner].members);
         let members = self.ensemble.members();
         let first = self.places[places[0]];
         // Per member: its penalty, and a bit for every place that it sees clean, and that it sees at all.
         let mut penalties = [f32::INFINITY; MOST_MEMBERS];
         for (penalty, &view) in penalties.iter_mut().zip(members) {
-            if let Some(vantage) = &vantages[usize::from(view)] {
-                *penalty = vantage.penalty(&scene.light_field.views[usize::from(view)], first);
-            }
+            *penalty = views.penalty(view, first);
         }
         let (mut clean, mut seen) = ([0_u64; MOST_MEMBERS], [0_u64; MOST_MEMBERS]);
         for (bit, &place) in places.iter().enumerate() {
@@ -208,17 +209,17 @@ impl CameraBlending {
                 break;
             }
             let mut best: Option<(f32, usize)> = None;
-            for (member, &view) in members.iter().enumerate() {
+            for member in 0..members.len() {
                 let (penalty, clean, seen) = (penalties[member], clean[member], seen[member]);
-                if !penalty.is_finite() || seen == 0 || corner.speaks(view) {
+                if !penalty.is_finite() || seen == 0 || corner.has(member) {
                     continue;
                 }
                 let mut worth = WORTH_OF_A_GLIMPSE * (seen & !clean & unseen).count_ones() as f32;
                 for (wanted, next) in wanted.iter().zip(WORTH_OF_NEXT) {
                     worth += next * (clean & wanted).count_ones() as f32;
                 }
-                let company = neighbours.iter().flatten().any(|n| n.speaks(view));
-                let cost = penalty - SIGHTING_WORTH * worth / total - if company { WORTH_OF_COMPANY } else { 0.0 };
+                let cost =
+                    penalty - SIGHTING_WORTH * worth / total - if company >> member & 1 != 0 { WORTH_OF_COMPANY } else { 0.0 };
                 if best.is_none_or(|b| cost < b.0) {
                     best = Some((cost, member));
                 }
@@ -241,6 +242,7 @@ impl CameraBlending {
                 weight: penalties[member],
             };
             corner.count += 1;
+            corner.members |= 1 << member;
         }
         // Buehler 2001: weights fall to zero at a threshold; here beyond the worst view that was needed.
         let threshold = 1.3 * corner.voices().iter().map(|v| v.weight).fold(0.01, f32::max);
@@ -313,4 +315,45 @@ fn places_of_block(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize
 
 fn places_around(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
     support(grid, i, j).flat_map(|cell| cell * PLACES_PER_CELL..(cell + 1) * PLACES_PER_CELL)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::specularity_substitution::example::{Example, HOLE};
+    use crate::stages::specularity_substitution::live::Live;
+
+    /// Voices at the corner nearest to the hole's middle.
+    fn voices(example: &Example) -> Vec<Voice> {
+        let (scene, vantages) = (example.scene(), example.vantages());
+        let views = Views {
+            full: &example.light_field.views,
+            vantages: &vantages,
+        };
+        let mut blending = CameraBlending::default();
+        let mut live = Live::default();
+        live.look(&scene);
+        blending.choose(&scene, &live.holes, &views, MOST_MEMBERS);
+        let block = scene.grid.block();
+        let corner = (HOLE.1 / block) * CameraBlending::corners_across(scene.grid) + HOLE.0 / block;
+        blending.corners()[corner].voices().to_vec()
+    }
+
+    #[test]
+    fn the_nearest_views_speak_and_the_nearer_the_louder() {
+        let moves: Vec<_> = (0..10).map(|i| (4.0 * (i + 1) as f32, 0.0)).collect();
+        let voices = voices(&Example::new(&moves, [1.0; 3], (0.0, 0.0)));
+        // All see the hole equally well, so the angle decides; three sightings are enough.
+        assert_eq!(voices.iter().map(|v| v.view).collect::<Vec<_>>(), [0, 1, 2]);
+        assert!(voices.windows(2).all(|pair| pair[0].weight > pair[1].weight), "{voices:?}");
+    }
+
+    #[test]
+    fn a_dazzled_view_does_not_speak_however_near_it_is() {
+        let mut example = Example::new(&[(1.0, 0.0), (6.0, 0.0), (8.0, 0.0), (9.0, 0.0)], [1.0; 3], (0.0, 0.0));
+        example.light_field.views[0].confidence.fill(0);
+        example.look_again();
+        let voices = voices(&example);
+        assert!(!voices.is_empty() && voices.iter().all(|v| v.view != 0), "{voices:?}");
+    }
 }

@@ -17,13 +17,15 @@ use crate::stages::specularity_substitution::view_fit::{ViewFit, part};
 /// At most so many views speak in a block, the loudest.
 const MAX_VOICES: usize = 16;
 /// So many clean sights of a pixel are enough.
-const ENOUGH_VIEWS: u16 = 5;
+const ENOUGH_VIEWS: u16 = 3;
 /// A sight is clean from this confidence on.
 const CLEAN: u8 = 230;
 /// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
 const BRIGHTER_HALF_LEVELS: f32 = 0.8;
 /// Rounds of that.
 const ROUNDS: usize = 5;
+/// A small pixel at most this much brighter than what was measured is taken for tissue, levels.
+const PLAIN_LEVELS: f32 = 2.0;
 /// The loudest views that are asked whether a small pixel shows the lamp at all.
 const ASKED: usize = 4;
 /// So many of them must have seen it clean …
@@ -85,15 +87,28 @@ pub struct Blended {
     pub view: usize,
 }
 
-/// Pixels of which it is known without drawing them that they do not show the lamp.
+/// A small pixel of which it is known without drawing its pixels that it does not show the lamp.
 #[derive(Clone, Copy, Debug)]
 pub struct Plain {
-    /// The cell, row by row over the picture.
-    pub cell: usize,
-    /// By how much the live picture is darker than what was measured, levels.
+    /// Its first column in the picture.
+    pub left: usize,
+    /// Its first row.
+    pub top: usize,
+    /// The luma that was measured, levels.
+    pub expected: f32,
+    /// By how much the live picture is darker than that, levels.
     pub darker: f32,
-    /// How many.
-    pub count: f32,
+}
+
+/// What is known of a small pixel before its pixels are drawn.
+#[derive(Clone, Copy, Debug)]
+enum Look {
+    /// None of it may be replaced.
+    Nothing,
+    /// It shows tissue.
+    Plain(Plain),
+    /// It may show the lamp.
+    Doubtful,
 }
 
 /// A view that speaks in a block.
@@ -200,6 +215,7 @@ impl Bench {
             for index in 0..self.speakers.len() {
                 wide::run(Draw {
                     view: &scene.light_field.views[self.speakers[index].view],
+                    small: &chosen.small_views[self.speakers[index].view],
                     block: Block::of(scene.grid, i, j),
                     index,
                     bench: self,
@@ -217,14 +233,14 @@ impl Bench {
                 let view = usize::from(voice.view);
                 if let Some(speaker) = self.speakers.iter_mut().find(|s| s.view == view) {
                     speaker.weights[index] = voice.weight;
-                } else if let Some(Vantage { mapping, .. }) = chosen.vantages[view] {
+                } else if let Some(Vantage { mapping, small, .. }) = chosen.vantages[view] {
                     let mut weights = [0.0; 4];
                     weights[index] = voice.weight;
                     self.speakers.push(Speaker {
                         view,
                         weights,
                         mapping,
-                        small_mapping: mapping.onto_coarser(chosen.small_views[view].step as f32),
+                        small_mapping: small,
                         field: [[[0.0; 8]; 3]; 3],
                     });
                 }
@@ -252,9 +268,11 @@ impl Bench {
                 let (x, y) = (i * SMALL_PER_BLOCK + column, j * SMALL_PER_BLOCK + row);
                 let (cell_column, cell_row) = (x / SMALL_PER_CELL, y / SMALL_PER_CELL);
                 if cell_column < grid.across && cell_row < grid.down && holes[cell_row * grid.across + cell_column] != 0 {
-                    let plain = self.plain_at(scene, chosen, (i, j), x, y);
-                    *doubtful = plain.is_none();
-                    self.plain.extend(plain.filter(|plain| plain.count > 0.0));
+                    match self.look_at_small(scene, chosen, Block::of(grid, i, j), (x * grid.step, y * grid.step)) {
+                        Look::Nothing => {}
+                        Look::Plain(plain) => self.plain.push(plain),
+                        Look::Doubtful => *doubtful = true,
+                    }
                 }
             }
         }
@@ -282,42 +300,40 @@ impl Bench {
         }
     }
 
-    /// What is known of a small pixel (column, row) without drawing its pixels; `None` where it may show the lamp.
-    fn plain_at(
-        &self,
-        scene: &Scene<'_>,
-        chosen: &Chosen<'_>,
-        (i, j): (usize, usize),
-        column: usize,
-        row: usize,
-    ) -> Option<Plain> {
+    /// What is known of a small pixel without drawing its pixels.
+    fn look_at_small(&self, scene: &Scene<'_>, chosen: &Chosen<'_>, block: Block, (left, top): (usize, usize)) -> Look {
         let (grid, step) = (scene.grid, scene.grid.step);
-        let (left, top) = (column * step, row * step);
-        let (mut sum, mut open, mut marked) = ([0_u32; 3], 0_u32, false);
-        for y in top..(top + step).min(grid.height) {
-            for x in left..(left + step).min(grid.width) {
-                open += u32::from(scene.is_open(x, y));
-                marked |= scene.distance.at(x, y) == 0;
-                for (sum, channel) in sum.iter_mut().zip(scene.image.at(x, y)) {
+        let (right, bottom) = ((left + step).min(grid.width), (top + step).min(grid.height));
+        if left >= right || top >= bottom {
+            return Look::Nothing;
+        }
+        let (mut nearest, mut forbidden, mut sum) = (u16::MAX, 0, [0_u32; 3]);
+        for y in top..bottom {
+            nearest = (scene.distance.row(y)[left..right].iter()).fold(nearest, |least, &d| least.min(d));
+            forbidden |= scene.forbidden.row(y)[left..right].iter().fold(0, |any, &f| any | f);
+            for pixel in &scene.image.row(y)[left..right] {
+                for (sum, &channel) in sum.iter_mut().zip(pixel) {
                     *sum += u32::from(channel);
                 }
             }
         }
-        let cell = row / SMALL_PER_CELL * grid.across + column / SMALL_PER_CELL;
-        let plain = |darker: f32| Plain {
-            cell,
-            darker,
-            count: open as f32,
-        };
-        if open == 0 {
-            return Some(plain(0.0));
+        if nearest > scene.reach {
+            return Look::Nothing;
         }
-        if marked || left + step > grid.width || top + step > grid.height {
-            return None;
+        // What is marked is looked at closely, and so are the edges of what may be touched.
+        if nearest == 0 || forbidden != 0 || left + step > grid.width || top + step > grid.height {
+            return Look::Doubtful;
         }
         let live = luma(sum.map(|s| s as f32)) / (step * step) as f32;
-        let expected = self.expected_at(scene, chosen, Block::of(grid, i, j), (left + step / 2, top + step / 2))?;
-        (live <= expected).then(|| plain(expected - live))
+        match self.expected_at(scene, chosen, block, (left + step / 2, top + step / 2)) {
+            Some(expected) if live <= expected + PLAIN_LEVELS => Look::Plain(Plain {
+                left,
+                top,
+                expected,
+                darker: expected - live,
+            }),
+            _ => Look::Doubtful,
+        }
     }
 
     /// The luma that the loudest views expect at a small pixel; `None` where too few see it clean.
@@ -393,6 +409,7 @@ impl Block {
 /// One speaker drawn over the spots that are not settled.
 struct Draw<'a> {
     view: &'a View,
+    small: &'a SmallView,
     block: Block,
     index: usize,
     bench: &'a mut Bench,
@@ -403,6 +420,7 @@ impl wide::Kernel for Draw<'_> {
     fn run(self) {
         let Self {
             view,
+            small,
             block,
             index,
             bench,
@@ -410,7 +428,7 @@ impl wide::Kernel for Draw<'_> {
         let speaker = &bench.speakers[index];
         let (width, height) = view.image.size();
         let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 2.0);
-        let (confidences, depths) = (view.confidence.pixels(), view.depth.pixels());
+        let confidences = view.confidence.pixels();
         let begin = index * bench.drawn.pitch;
         let (mut row, mut columns) = (u16::MAX, [[0.0; 8]; 3]);
         for (k, spot) in bench.spots.iter_mut().enumerate() {
@@ -437,7 +455,7 @@ impl wide::Kernel for Draw<'_> {
                 &confidences[corner + width..corner + width + 2],
             );
             let least = upper[0].min(upper[1]).min(lower[0]).min(lower[1]);
-            if least == 0 || !is_unoccluded(depths[corner], depth) {
+            if least == 0 || !is_unoccluded(small.depth_at(x0, y0), depth) {
                 continue;
             }
             let color = brightened(bicubic(&view.image, x0, y0, u - x0 as f32, v - y0 as f32), &field);
@@ -526,5 +544,174 @@ impl wide::Kernel for Blend<'_> {
                 }));
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::{RngExt as _, SeedableRng as _};
+
+    use super::*;
+    use crate::stages::specularity_substitution::ensemble::MOST_MEMBERS;
+    use crate::stages::specularity_substitution::example::{Example, HOLE, in_hole};
+    use crate::stages::specularity_substitution::live::Live;
+    use crate::stages::specularity_substitution::settings::Settings;
+    use crate::stages::specularity_substitution::sight::Views;
+    use crate::stages::specularity_substitution::view_fit::{Comparison, Workbench};
+
+    /// Spots and what was blended of them in the block of the hole's middle.
+    fn blended(example: &Example) -> Bench {
+        let (scene, vantages, settings) = (example.scene(), example.vantages(), Settings::default());
+        let views = Views {
+            full: &example.light_field.views,
+            vantages: &vantages,
+        };
+        let (mut blending, mut live) = (CameraBlending::default(), Live::default());
+        live.look(&scene);
+        blending.choose(&scene, &live.holes, &views, MOST_MEMBERS);
+        let block = scene.grid.block();
+        let (i, j) = (HOLE.0 / block, HOLE.1 / block);
+        let mut fits = Vec::new();
+        for (small, vantage) in example.small_views.iter().zip(&vantages) {
+            let mut fit = ViewFit::default();
+            fit.begin(scene.grid);
+            fit.need_around(&scene, &live, i, j);
+            let comparison = Comparison {
+                grid: scene.grid,
+                scale: scene.scale,
+                live: &live,
+                view: small,
+                mapping: &vantage.unwrap().small,
+                settings: &settings,
+            };
+            fit.measure(&comparison, &mut Workbench::default());
+            fits.push(fit);
+        }
+        let chosen = Chosen {
+            corners: blending.corners(),
+            fits: &fits,
+            small_views: &example.small_views,
+            vantages: &vantages,
+        };
+        let mut bench = Bench::default();
+        bench.blend(&scene, &live.holes, &chosen, i, j);
+        bench
+    }
+
+    #[test]
+    fn under_the_lamp_the_tissue_is_found_and_tissue_is_not_drawn() {
+        let example = Example::new(&[(4.0, 0.0), (-4.0, 1.0), (1.0, 5.0), (0.0, -5.0)], [1.0; 3], (0.0, 0.0));
+        let bench = blended(&example);
+        assert!(
+            bench
+                .blended()
+                .filter(|(spot, _)| in_hole(spot.x.into(), spot.y.into()))
+                .count()
+                > 30
+        );
+        for (spot, blended) in bench.blended() {
+            let truth = example.truth(spot.x.into(), spot.y.into());
+            for (found, truth) in blended.color.into_iter().zip(truth) {
+                assert!((found - truth).abs() < 3.0, "{spot:?}: {:?} for {truth}", blended.color);
+            }
+            assert!(blended.confidence > 0.95);
+        }
+    }
+
+    #[test]
+    fn a_view_that_is_dazzled_unnoticed_is_not_heard() {
+        let mut example = Example::new(&[(4.0, 0.0), (-4.0, 1.0), (1.0, 5.0), (0.0, -5.0)], [1.0; 3], (0.0, 0.0));
+        // View 0 shows the lamp at the hole and believes itself.
+        let (u, v, _) = example.vantages()[0].unwrap().mapping.apply(
+            HOLE.0 as f32,
+            HOLE.1 as f32,
+            crate::stages::specularity_substitution::example::DEPTH,
+        );
+        let image = &mut example.light_field.views[0].image;
+        for y in v as usize - 8..v as usize + 9 {
+            for pixel in &mut image.row_mut(y)[u as usize - 8..u as usize + 9] {
+                *pixel = pixel.map(|c| c.saturating_add(60));
+            }
+        }
+        example.look_again();
+        let bench = blended(&example);
+        let mut seen = 0;
+        for (spot, blended) in bench.blended().filter(|(spot, _)| in_hole(spot.x.into(), spot.y.into())) {
+            let truth = luma(example.truth(spot.x.into(), spot.y.into()));
+            assert!(
+                (luma(blended.color) - truth).abs() < 3.0,
+                "{spot:?}: {:?} for {truth}",
+                blended.color
+            );
+            seen += 1;
+        }
+        assert!(seen > 30);
+    }
+
+    /// The plainest possible blend of one spot.
+    fn reference(drawn: &[([f32; 3], f32)]) -> Option<[f32; 3]> {
+        let mut reference = f32::INFINITY;
+        let mut color = None;
+        for _ in 0..=ROUNDS {
+            let (mut sum, mut total) = ([0.0_f32; 3], 0.0);
+            for (color, weight) in drawn {
+                let brighter = (luma(*color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
+                let weight = weight / (1.0 + brighter * brighter);
+                for (sum, channel) in sum.iter_mut().zip(color) {
+                    *sum += weight * channel;
+                }
+                total += weight;
+            }
+            if total < 1e-12 {
+                return None;
+            }
+            let mean = sum.map(|s| s / total);
+            reference = luma(mean);
+            color = Some(mean);
+        }
+        color
+    }
+
+    #[test]
+    fn blending_equals_its_plain_twin() {
+        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(3);
+        let example = Example::new(&[(4.0, 0.0), (-4.0, 1.0), (1.0, 5.0), (0.0, -5.0)], [1.0; 3], (0.0, 0.0));
+        let mut bench = blended(&example);
+        let (spots, speakers) = (bench.spots.len(), bench.speakers.len());
+        assert!(spots > 9 && speakers > 2);
+        bench.drawn.clear(spots, speakers);
+        for speaker in 0..speakers {
+            for k in 0..spots {
+                let at = speaker * bench.drawn.pitch + k;
+                if k != 4 && random.random_bool(0.7) {
+                    let color: [f32; 3] = [random.random_range(20.0..200.0), random.random_range(20.0..200.0), 60.0];
+                    for (plane, channel) in bench.drawn.color.iter_mut().zip(color) {
+                        plane[at] = channel;
+                    }
+                    bench.drawn.luma[at] = luma(color);
+                    bench.drawn.weight[at] = random.random_range(0.01..1.0);
+                }
+            }
+        }
+        bench.blended.clear();
+        wide::run(Blend(&mut bench));
+        assert_eq!(bench.blended.len(), spots);
+        for k in 0..spots {
+            let of = |speaker: usize| {
+                let at = speaker * bench.drawn.pitch + k;
+                ([0, 1, 2].map(|c| bench.drawn.color[c][at]), bench.drawn.weight[at])
+            };
+            let expected = reference(&(0..speakers).map(of).collect::<Vec<_>>());
+            match (bench.blended[k], expected) {
+                (None, None) => {}
+                (Some(found), Some(expected)) => {
+                    for (found, expected) in found.color.into_iter().zip(expected) {
+                        assert!((found - expected).abs() < 0.02, "{k}: {found} for {expected}");
+                    }
+                }
+                (found, expected) => panic!("{k}: {found:?} for {expected:?}"),
+            }
+        }
+        assert!(bench.blended[4].is_none());
     }
 }

@@ -6,8 +6,7 @@
 
 use rayon::prelude::*;
 
-use crate::stages::specularity_substitution::scene::Scene;
-use crate::stages::specularity_substitution::sight::{Place, Sight, Vantage};
+use crate::stages::specularity_substitution::sight::{Place, Sight, Views};
 
 /// At most so many views can take part.
 pub const MOST_MEMBERS: usize = 64;
@@ -44,18 +43,18 @@ impl Ensemble {
     }
 
     /// Choose at most `limit` views for the places that stand for the holes of a frame.
-    pub fn gather(&mut self, scene: &Scene<'_>, vantages: &[Option<Vantage>], places: &[Place], limit: usize) {
+    pub fn gather(&mut self, views: &Views<'_>, places: &[Place], limit: usize) {
+        let Views { full, vantages } = views;
         std::mem::swap(&mut self.members, &mut self.former);
         self.members.clear();
         self.weight.clear();
         self.weight.resize(places.len(), 1.0);
         self.worth.clear();
         self.worth.resize(places.len() * vantages.len(), 0.0);
-        let views = &scene.light_field.views;
         self.worth
             .par_chunks_mut(places.len().max(1))
-            .zip(vantages)
-            .zip(views)
+            .zip(*vantages)
+            .zip(*full)
             .for_each(|((worth, vantage), view)| {
                 let Some(vantage) = vantage else { return };
                 for (worth, &place) in worth.iter_mut().zip(places) {
@@ -109,4 +108,67 @@ fn sum_of_products(a: &[f32], b: &[f32]) -> f32 {
         }
     }
     lanes.iter().sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::specularity_substitution::example::{DEPTH, Example};
+
+    /// Eight views on a line, and places over the picture; view 6 alone sees the first place.
+    fn example() -> (Example, Vec<Place>) {
+        let moves: Vec<_> = (0..8).map(|i| (2.0 * i as f32 - 7.0, 0.0)).collect();
+        let mut example = Example::new(&moves, [1.0; 3], (0.0, 0.0));
+        let places: Vec<Place> = (0..6)
+            .map(|i| Place {
+                x: 120.0 + 40.0 * i as f32,
+                y: 120.0,
+                depth: DEPTH,
+            })
+            .collect();
+        let vantages = example.vantages();
+        for (view, vantage) in vantages.iter().enumerate().filter(|(view, _)| *view != 6) {
+            let (u, v, _) = vantage.unwrap().mapping.apply(places[0].x, places[0].y, DEPTH);
+            let confidence = &mut example.light_field.views[view].confidence;
+            for y in v as usize - 4..v as usize + 5 {
+                confidence.row_mut(y)[u as usize - 4..u as usize + 5].fill(0);
+            }
+        }
+        example.look_again();
+        (example, places)
+    }
+
+    #[test]
+    fn the_only_view_that_sees_a_place_takes_part_and_the_limit_holds() {
+        let (example, places) = example();
+        let vantages = example.vantages();
+        let views = Views {
+            full: &example.light_field.views,
+            vantages: &vantages,
+        };
+        let mut ensemble = Ensemble::default();
+        for limit in [2, 3, 5] {
+            ensemble.gather(&views, &places, limit);
+            assert_eq!(ensemble.members().len(), limit);
+            assert!(ensemble.members().contains(&6), "{:?}", ensemble.members());
+            assert!(ensemble.members().is_sorted());
+        }
+    }
+
+    #[test]
+    fn members_stay_unless_another_view_is_clearly_better() {
+        let (example, places) = example();
+        let vantages = example.vantages();
+        let views = Views {
+            full: &example.light_field.views,
+            vantages: &vantages,
+        };
+        let mut ensemble = Ensemble::default();
+        ensemble.gather(&views, &places, 3);
+        let before = ensemble.members().to_vec();
+        // A little to the side: what is best by a hair changes.
+        let moved: Vec<Place> = places.iter().map(|p| Place { x: p.x + 2.0, ..*p }).collect();
+        ensemble.gather(&views, &moved, 3);
+        assert_eq!(ensemble.members(), before);
+    }
 }

@@ -231,3 +231,43 @@ fn look_at_row(scene: &Scene<'_>, row: usize, pixels: &mut [SmallPixel], holes: 
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::specularity_substitution::example::{Example, HOLE, in_hole};
+
+    #[test]
+    fn good_pixels_lie_around_the_hole_and_know_their_neighbours() {
+        let example = Example::new(&[], [1.0; 3], (0.0, 0.0));
+        let scene = example.scene();
+        let mut live = Live::default();
+        live.look(&scene);
+        assert!(live.good.len() > 800);
+        for (place, good) in live.good.iter().enumerate() {
+            let (x, y) = (good.x as usize, good.y as usize);
+            let distance = scene.distance.at(x, y);
+            assert!(!in_hole(x, y) && distance > scene.guard && distance <= scene.ring);
+            assert!((good.brightness - DARK_LEVELS - luma(example.image.at(x, y).map(f32::from))).abs() < 1e-3);
+            let block = scene.grid.block_at(x, y);
+            let (first, of_block) = live.good_of(block);
+            assert!((first..first + of_block.len()).contains(&place));
+            for (neighbour, (dx, dy)) in good
+                .around
+                .into_iter()
+                .zip([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
+            {
+                if let Some(neighbour) = live.good.get(neighbour as usize) {
+                    assert_eq!((neighbour.x, neighbour.y), (good.x + dx, good.y + dy));
+                }
+            }
+            if let Some(slope) = good.slope {
+                let at = |i: usize| live.good[good.around[i] as usize].brightness;
+                assert!((slope[0] - 0.25 * (at(1) - at(0)) / good.brightness).abs() < 1e-5);
+                assert!((slope[1] - 0.25 * (at(3) - at(2)) / good.brightness).abs() < 1e-5);
+            }
+        }
+        assert_eq!(live.hole_blocks[scene.grid.block_at(HOLE.0, HOLE.1)], 1);
+        assert_eq!(live.hole_blocks[0], 0);
+    }
+}

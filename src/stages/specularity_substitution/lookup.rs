@@ -57,4 +57,38 @@ mod tests {
         let color = bicubic(&image, 4, 5, 0.3, 0.6);
         assert!((color[0] - 43.0).abs() < 0.03 && (color[1] - 67.2).abs() < 0.03 && (color[2] - 77.0).abs() < 1e-3);
     }
+
+    /// The plainest possible: Keys' cubic of each of the sixteen pixels.
+    fn reference(image: &Image<Rgb8>, u: f64, v: f64, c: usize) -> f64 {
+        let cubic = |d: f64| match d.abs() {
+            d if d < 1.0 => 1.5 * d * d * d - 2.5 * d * d + 1.0,
+            d if d < 2.0 => -0.5 * d * d * d + 2.5 * d * d - 4.0 * d + 2.0,
+            _ => 0.0,
+        };
+        let mut sum = 0.0;
+        for y in 0..image.height() {
+            for x in 0..image.width() {
+                sum += f64::from(image.at(x, y)[c]) * cubic(u - x as f64) * cubic(v - y as f64);
+            }
+        }
+        sum
+    }
+
+    #[test]
+    fn agrees_with_the_plain_twin() {
+        let noise = (0..20 * 14_u32).map(|i| [7919, 104_729, 1_299_709].map(|p| (i.wrapping_mul(p) >> 3) as u8));
+        let image = Image::from_vec(20, 14, noise.collect()).unwrap();
+        for (u, v) in [(1.0_f64, 1.0_f64), (4.37, 6.81), (16.99, 10.5), (9.002, 3.25)] {
+            let found = bicubic(&image, u as usize, v as usize, u.fract() as f32, v.fract() as f32);
+            for (c, found) in found.into_iter().enumerate() {
+                // A place is off by at most half a step, along which a pixel changes by at most 255 · 1.5 levels an axis.
+                let bound = 2.0 * 0.5 / STEPS as f64 * 255.0 * 1.5;
+                let expected = reference(&image, u, v, c);
+                assert!(
+                    (f64::from(found) - expected).abs() < bound,
+                    "({u}, {v}): {found} for {expected}"
+                );
+            }
+        }
+    }
 }

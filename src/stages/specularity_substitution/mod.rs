@@ -18,6 +18,8 @@ pub mod blend;
 pub mod camera_blending;
 pub mod drawing;
 pub mod ensemble;
+#[cfg(test)]
+pub mod example;
 pub mod grid;
 pub mod live;
 pub mod lookup;

@@ -72,6 +72,13 @@ impl SmallView {
         (self.width as f32 - 1.0, self.height as f32 - 1.0)
     }
 
+    /// Depth at a pixel of the view itself, mm, 0 where unknown.
+    #[inline]
+    pub fn depth_at(&self, x: usize, y: usize) -> f32 {
+        let (x, y) = ((x / self.step).min(self.width - 1), (y / self.step).min(self.height - 1));
+        self.pixels[y * self.width + x].depth
+    }
+
     /// What is shown at column `u` and row `v`, linear between pixels; both at least 0 and before the last.
     #[inline]
     pub fn between(&self, u: f32, v: f32) -> Sample {
@@ -91,5 +98,31 @@ impl SmallView {
             confidence: a[3].min(b[3]).min(c[3]).min(d[3]),
             depth: row[usize::from(fx >= 0.5)].depth,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::specularity_substitution::example::Example;
+
+    #[test]
+    fn between_pixels_it_is_linear_and_as_sure_as_the_least_sure() {
+        let mut example = Example::new(&[(0.0, 0.0)], [1.0; 3], (0.0, 0.0));
+        let view = &mut example.light_field.views[0];
+        for y in 0..view.image.height() {
+            for x in 0..view.image.width() {
+                view.image.set(x, y, [(x / 4) as u8, (y / 2) as u8, 77]);
+                view.confidence.set(x, y, (x % 200) as u8);
+            }
+        }
+        let small = SmallView::of(view);
+        assert_eq!(small.step, 1);
+        let sample = small.between(84.0, 50.0);
+        assert_eq!((sample.color, sample.confidence), ([21.0, 25.0, 77.0], 84));
+        // From column 83, which is one level darker.
+        let sample = small.between(83.25, 51.5);
+        assert!((sample.color[0] - 20.25).abs() < 1e-4 && (sample.color[1] - 25.5).abs() < 1e-4);
+        assert_eq!(sample.confidence, 83);
     }
 }

@@ -23,14 +23,14 @@ use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::replacement::{Planes, replace};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
-use crate::stages::specularity_substitution::sight::Vantage;
+use crate::stages::specularity_substitution::sight::{Vantage, Views};
 use crate::stages::specularity_substitution::small_view::SmallView;
 use crate::stages::specularity_substitution::view_fit::{Comparison, Statistics, ViewFit, Workbench};
 
 /// Depth is carried into holes over about 2 to this power, px of the depth's picture.
-const DEPTH_REACH_LEVELS: usize = 6;
+const DEPTH_REACH_LEVELS: usize = 5;
 /// Widest picture over which depth is drawn pixel for pixel.
-const DEPTH_WIDTH_PX: usize = 960;
+const DEPTH_WIDTH_PX: usize = 480;
 /// Picture pixels along a pixel of the depth's picture.
 fn depth_step(width: usize) -> usize {
     width.div_ceil(DEPTH_WIDTH_PX).max(1)
@@ -144,17 +144,23 @@ impl SpecularitySubstitution {
             ring,
         };
         self.vantages.clear();
-        self.vantages
-            .extend(light_field.views.iter().map(|view| Vantage::new(camera, eye, view)));
-        self.blending.choose(&scene, &self.vantages, self.settings.max_views);
+        self.vantages.extend(
+            (light_field.views.iter().zip(&self.small_views)).map(|(view, small)| Vantage::new(camera, eye, view, small)),
+        );
+        let views = Views {
+            full: &light_field.views,
+            vantages: &self.vantages,
+        };
         self.live.look(&scene);
+        self.blending
+            .choose(&scene, &self.live.holes, &views, self.settings.max_views);
         call_for_fits(&scene, &self.live, &self.blending, &mut self.fits);
         let (benches, vantages) = (&self.benches, &self.vantages);
         let needed = self.fits.par_iter_mut().zip(&self.small_views).zip(vantages).with_max_len(1);
         needed
             .filter(|((fit, _), _)| fit.is_needed())
             .for_each(|((fit, view), vantage)| {
-                if let Some(Vantage { mapping, .. }) = vantage {
+                if let Some(Vantage { small: mapping, .. }) = vantage {
                     let comparison = Comparison {
                         grid: scene.grid,
                         scale: scene.scale,

@@ -44,10 +44,12 @@ pub mod part {
     pub const FIT: usize = 5;
     /// What difference is left around the hole, root mean square, levels.
     pub const RESIDUAL: usize = 6;
+    /// The factor of luma: not the luma of the three factors, for tissue is not gray.
+    pub const BRIGHTNESS: usize = 7;
 }
 
 /// What a field says of a view that was not looked at.
-const UNKNOWN: Sums = [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+const UNKNOWN: Sums = [1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
 
 /// A view's fields, from frame to frame.
 #[derive(Debug, Default)]
@@ -92,9 +94,9 @@ pub struct Comparison<'a> {
     pub scale: f32,
     /// The good pixels.
     pub live: &'a Live,
-    /// The view.
+    /// The view, small.
     pub view: &'a SmallView,
-    /// From pixels of the live picture to those of the view.
+    /// From pixels of the live picture to those of the small view.
     pub mapping: &'a Mapping,
     /// Lengths in px of a picture of the usual width.
     pub settings: &'a Settings,
@@ -152,7 +154,7 @@ impl ViewFit {
         self.span = self.span.around(span);
     }
 
-    /// Find the fields. A view that spoke in the last frame goes on from there, so one round is enough.
+    /// Find the fields. A view that spoke in the last frame goes on from there.
     pub fn measure(&mut self, with: &Comparison<'_>, bench: &mut Workbench) {
         let (across, down) = with.grid.blocks();
         for (row, blocks) in self.field.chunks_mut(across).enumerate() {
@@ -166,12 +168,7 @@ impl ViewFit {
             sums.clear();
             sums.resize(across * down, [0.0; 8]);
         }
-        let rounds = if self.former.is_empty() {
-            with.settings.ring_rounds.max(1)
-        } else {
-            1
-        };
-        for round in 0..rounds {
+        for round in 0..with.settings.ring_rounds.max(1) {
             wide::run(Draw {
                 fit: self,
                 with,
@@ -194,24 +191,28 @@ impl ViewFit {
         for row in self.span.rows() {
             let blocks = self.span.row(row, across);
             for (field, sums) in self.field[blocks.clone()].iter_mut().zip(&sums[blocks]) {
-                for c in 0..3 {
-                    field[part::GAIN + c] = if sums[4 + c] > 0.0 {
-                        (sums[1 + c] / sums[4 + c]).clamp(1.0 / MAX_GAIN, MAX_GAIN)
+                let ratio = |live: f32, view: f32| {
+                    if view > 0.0 {
+                        (live / view).clamp(1.0 / MAX_GAIN, MAX_GAIN)
                     } else {
                         1.0
-                    };
+                    }
+                };
+                for c in 0..3 {
+                    field[part::GAIN + c] = ratio(sums[1 + c], sums[4 + c]);
                 }
+                field[part::BRIGHTNESS] = ratio(luma([sums[1], sums[2], sums[3]]), luma([sums[4], sums[5], sums[6]]));
             }
         }
     }
 
-    /// The mean gains of a block and the eight around it, row by row.
+    /// The factors of luma of a block and the eight around it, row by row.
     #[inline]
     fn gains_around(&self, (across, down): (usize, usize), column: usize, row: usize) -> [[f32; 3]; 3] {
         let near = |place: usize, step: usize, count: usize| (place + step).saturating_sub(1).min(count - 1);
         std::array::from_fn(|j| {
             let begin = near(row, j, down) * across;
-            std::array::from_fn(|i| mean_gain(&self.field[begin + near(column, i, across)]))
+            std::array::from_fn(|i| self.field[begin + near(column, i, across)][part::BRIGHTNESS])
         })
     }
 
@@ -288,7 +289,7 @@ impl wide::Kernel for Draw<'_> {
     fn run(self) {
         let Self { fit, with, bench, again } = self;
         let across = with.grid.blocks().0;
-        let mapping = with.mapping.onto_coarser(with.view.step as f32);
+        let mapping = with.mapping;
         let (last_x, last_y) = with.view.last();
         bench.seen.clear();
         bench.seen.resize(with.live.good.len() + 1, 0.0);
@@ -302,7 +303,7 @@ impl wide::Kernel for Draw<'_> {
             if fit.context[block] != 0 {
                 let field = fit.field[block];
                 let again = again || fit.former.holds(column, row);
-                let gain = mean_gain(&field);
+                let gain = field[part::BRIGHTNESS];
                 let (first, good) = with.live.good_of(block);
                 for (good, seen) in good.iter().zip(&mut bench.seen[first..]) {
                     let (u, v, depth) = mapping.apply(good.x + field[part::SHIFT], good.y + field[part::SHIFT + 1], good.depth);
@@ -398,6 +399,90 @@ fn between(blocks: &[[f32; 3]; 3], x: u8, y: u8) -> f32 {
     top + (bottom - top) * fy
 }
 
-fn mean_gain(field: &Sums) -> f32 {
-    luma([field[part::GAIN], field[part::GAIN + 1], field[part::GAIN + 2]])
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::specularity_substitution::example::{Example, HOLE};
+
+    /// The field in the middle of the hole after so many frames.
+    fn measured(example: &Example, frames: usize) -> Sums {
+        let (scene, vantages, settings) = (example.scene(), example.vantages(), Settings::default());
+        let mut live = Live::default();
+        live.look(&scene);
+        let (mut fit, mut bench) = (ViewFit::default(), Workbench::default());
+        for _ in 0..frames {
+            fit.begin(scene.grid);
+            let block = scene.grid.block();
+            for (i, j) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
+                fit.need_around(&scene, &live, HOLE.0 / block + i, HOLE.1 / block + j);
+            }
+            let comparison = Comparison {
+                grid: scene.grid,
+                scale: scene.scale,
+                live: &live,
+                view: &example.small_views[0],
+                mapping: &vantages[0].unwrap().small,
+                settings: &settings,
+            };
+            fit.measure(&comparison, &mut bench);
+        }
+        assert!(fit.is_needed() && fit.statistics().count > 0.0);
+        scene.grid.between(&fit.field, HOLE.0 as f32, HOLE.1 as f32)
+    }
+
+    #[test]
+    fn a_known_brightness_is_found_around_a_hole() {
+        let gain = [0.8, 1.1, 0.95];
+        let field = measured(&Example::new(&[(3.0, 1.0)], gain, (0.0, 0.0)), 2);
+        // Gains apply with the dark levels added; pictures are rounded to whole levels, which some hundred pixels average out.
+        for (c, gain) in gain.into_iter().enumerate() {
+            let level = [140.0, 90.0, 80.0][c];
+            let expected = (gain * level + DARK_LEVELS) / (level + DARK_LEVELS);
+            let found = field[part::GAIN + c];
+            assert!((found / expected - 1.0).abs() < 0.01, "{c}: {found} for {expected}");
+        }
+        assert!(field[part::FIT] > 0.9, "{field:?}");
+    }
+
+    #[test]
+    fn a_known_shift_is_found_from_frame_to_frame() {
+        let shift = (0.7, -0.5);
+        let example = Example::new(&[(3.0, 1.0)], [0.9; 3], shift);
+        // Each frame goes on from the last; the prior holds every step back.
+        let field = measured(&example, 8);
+        assert!((field[part::SHIFT] - shift.0).abs() < 0.15, "{field:?}");
+        assert!((field[part::SHIFT + 1] - shift.1).abs() < 0.15, "{field:?}");
+        let first = measured(&example, 1);
+        assert!(
+            first[part::SHIFT] > 0.0 && first[part::SHIFT] < field[part::SHIFT],
+            "{first:?}"
+        );
+    }
+
+    #[test]
+    fn without_texture_no_shift_is_invented() {
+        let mut example = Example::new(&[(3.0, 1.0)], [1.0; 3], (0.0, 0.0));
+        for view in &mut example.light_field.views {
+            view.image.fill([120, 80, 70]);
+        }
+        example.image.fill([120, 80, 70]);
+        example.look_again();
+        let field = measured(&example, 3);
+        assert!(
+            field[part::SHIFT].abs() < 1e-3 && field[part::SHIFT + 1].abs() < 1e-3,
+            "{field:?}"
+        );
+    }
+
+    #[test]
+    fn another_tissue_does_not_fit() {
+        let mut example = Example::new(&[(3.0, 1.0)], [1.0; 3], (0.0, 0.0));
+        // Turned upside down.
+        let turned = example.light_field.views[0].image.pixels().iter().rev().copied().collect();
+        let (width, height) = example.light_field.views[0].image.size();
+        example.light_field.views[0].image = crate::image::buffer::Image::from_vec(width, height, turned).unwrap();
+        example.look_again();
+        let field = measured(&example, 1);
+        assert!(field[part::FIT] < 0.9 && field[part::RESIDUAL] > 6.0, "{field:?}");
+    }
 }
