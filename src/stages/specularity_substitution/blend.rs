@@ -160,7 +160,7 @@ impl Canvas {
                         let index = y * width + x;
                         color[index] = blended.color.map(|v| (v + 0.5) as u8);
                         belief[index] = (255.0 * blended.confidence).clamp(f32::from(PLAIN) + 1.0, 255.0) as u8;
-                        source[index] = blended.view as u16;
+                        source[index] = bench.view_of(&blended) as u16;
                         let unsure = RESIDUAL_WEIGHT * (blended.residual - USUAL_RESIDUAL_LEVELS).max(0.0);
                         excess[index] = excess_of(scene, spot, blended.color) - unsure;
                         let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];

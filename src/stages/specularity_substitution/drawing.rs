@@ -6,6 +6,7 @@ use crate::image::wide;
 use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::camera_blending::{CameraBlending, Corner};
+use crate::stages::specularity_substitution::drawn::{Blended, Drawn};
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Sums};
 use crate::stages::specularity_substitution::live::DARK_LEVELS;
 use crate::stages::specularity_substitution::lookup::bicubic;
@@ -20,10 +21,6 @@ const MAX_VOICES: usize = 16;
 const ENOUGH_VIEWS: u16 = 3;
 /// A sight is clean from this confidence on.
 const CLEAN: u8 = 230;
-/// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
-const BRIGHTER_HALF_LEVELS: f32 = 0.8;
-/// Rounds of that.
-const ROUNDS: usize = 5;
 /// A small pixel at most this much brighter than what was measured is taken for tissue, levels.
 const PLAIN_LEVELS: f32 = 2.0;
 /// The loudest views that are asked whether a small pixel shows the lamp at all.
@@ -32,9 +29,6 @@ const ASKED: usize = 4;
 const WITNESSES: u16 = 2;
 /// … at a place where they fit at least so well.
 const WITNESS_FIT: f32 = 0.5;
-/// Spots blended at a time.
-const LANES: usize = 8;
-
 /// What drawing needs besides the scene.
 #[derive(Clone, Copy, Debug)]
 pub struct Chosen<'a> {
@@ -72,19 +66,6 @@ impl Spot {
     fn is_settled(&self) -> bool {
         self.clean >= ENOUGH_VIEWS || self.clean >= 2 && self.live <= self.luma / f32::from(self.clean)
     }
-}
-
-/// What the views say of a spot together.
-#[derive(Clone, Copy, Debug)]
-pub struct Blended {
-    /// Levels.
-    pub color: [f32; 3],
-    /// 0…1.
-    pub confidence: f32,
-    /// What difference the views leave around the hole, levels.
-    pub residual: f32,
-    /// Index of the loudest view.
-    pub view: usize,
 }
 
 /// A small pixel of which it is known without drawing its pixels that it does not show the lamp.
@@ -154,38 +135,6 @@ fn mixed(a: &Sums, b: &Sums, t: f32) -> Sums {
     std::array::from_fn(|i| a[i] + t * (b[i] - a[i]))
 }
 
-/// What every speaker shows at every spot, plane by plane, speaker by speaker.
-#[derive(Debug, Default)]
-struct Drawn {
-    /// Spots, rounded up to whole lanes.
-    pitch: usize,
-    color: [Vec<f32>; 3],
-    luma: Vec<f32>,
-    /// 0 where nothing was drawn.
-    weight: Vec<f32>,
-    confidence: Vec<f32>,
-    residual: Vec<f32>,
-}
-
-impl Drawn {
-    fn clear(&mut self, spots: usize, speakers: usize) {
-        self.pitch = spots.next_multiple_of(LANES);
-        let [r, g, b] = &mut self.color;
-        for plane in [
-            r,
-            g,
-            b,
-            &mut self.luma,
-            &mut self.weight,
-            &mut self.confidence,
-            &mut self.residual,
-        ] {
-            plane.clear();
-            plane.resize(self.pitch * speakers, 0.0);
-        }
-    }
-}
-
 /// Working memory of one block at a time.
 #[derive(Debug, Default)]
 pub struct Bench {
@@ -205,6 +154,11 @@ impl Bench {
         pairs.filter_map(|(spot, blended)| Some((*spot, (*blended)?)))
     }
 
+    /// Index of the view that was loudest.
+    pub fn view_of(&self, blended: &Blended) -> usize {
+        self.speakers[blended.speaker].view
+    }
+
     /// Blend the views over block (i, j).
     pub fn blend(&mut self, scene: &Scene<'_>, holes: &[u8], chosen: &Chosen<'_>, i: usize, j: usize) {
         self.find_speakers(scene, chosen, i, j);
@@ -221,7 +175,7 @@ impl Bench {
                     bench: self,
                 });
             }
-            wide::run(Blend(self));
+            self.drawn.blend(self.spots.len(), &mut self.blended);
         }
     }
 
@@ -478,79 +432,8 @@ impl wide::Kernel for Draw<'_> {
     }
 }
 
-/// Every spot's colour from its speakers, the darker heard rather than the brighter.
-struct Blend<'a>(&'a mut Bench);
-
-impl wide::Kernel for Blend<'_> {
-    #[inline(always)]
-    fn run(self) {
-        let Self(bench) = self;
-        let (drawn, count) = (&bench.drawn, bench.spots.len());
-        for begin in (0..count).step_by(LANES) {
-            let lanes = |plane: &[f32], speaker: usize| -> [f32; LANES] {
-                let at = speaker * drawn.pitch + begin;
-                std::array::from_fn(|lane| plane[at..at + LANES][lane])
-            };
-            let weights = |speaker: usize, reference: &[f32; LANES]| -> [f32; LANES] {
-                let (weight, luma) = (lanes(&drawn.weight, speaker), lanes(&drawn.luma, speaker));
-                std::array::from_fn(|lane| {
-                    let brighter = (luma[lane] - reference[lane]).max(0.0) * (1.0 / BRIGHTER_HALF_LEVELS);
-                    weight[lane] / (1.0 + brighter * brighter)
-                })
-            };
-            let mut reference = [f32::INFINITY; LANES];
-            for _ in 0..ROUNDS {
-                let (mut total, mut sum) = ([1e-20_f32; LANES], [0.0_f32; LANES]);
-                for speaker in 0..bench.speakers.len() {
-                    let (weight, luma) = (weights(speaker, &reference), lanes(&drawn.luma, speaker));
-                    for lane in 0..LANES {
-                        total[lane] += weight[lane];
-                        sum[lane] += weight[lane] * luma[lane];
-                    }
-                }
-                for lane in 0..LANES {
-                    reference[lane] = sum[lane] / total[lane];
-                }
-            }
-            // Red, green, blue, confidence, residual.
-            let mut sums = [[0.0_f32; LANES]; 5];
-            let (mut total, mut most, mut loudest) = ([0.0_f32; LANES], [0.0_f32; LANES], [0_u32; LANES]);
-            for speaker in 0..bench.speakers.len() {
-                let weight = weights(speaker, &reference);
-                let [r, g, b] = &drawn.color;
-                for (sum, plane) in sums.iter_mut().zip([r, g, b, &drawn.confidence, &drawn.residual]) {
-                    let values = lanes(plane, speaker);
-                    for lane in 0..LANES {
-                        sum[lane] += weight[lane] * values[lane];
-                    }
-                }
-                for lane in 0..LANES {
-                    total[lane] += weight[lane];
-                    loudest[lane] = if weight[lane] > most[lane] {
-                        speaker as u32
-                    } else {
-                        loudest[lane]
-                    };
-                    most[lane] = most[lane].max(weight[lane]);
-                }
-            }
-            for lane in 0..LANES.min(count - begin) {
-                let mean = |part: usize| sums[part][lane] / total[lane];
-                bench.blended.push((total[lane] > 1e-12).then(|| Blended {
-                    color: [mean(0), mean(1), mean(2)].map(|c| c.clamp(0.0, 255.0)),
-                    confidence: mean(3),
-                    residual: mean(4),
-                    view: bench.speakers[loudest[lane] as usize].view,
-                }));
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use rand::{RngExt as _, SeedableRng as _};
-
     use super::*;
     use crate::stages::specularity_substitution::ensemble::MOST_MEMBERS;
     use crate::stages::specularity_substitution::example::{Example, HOLE, in_hole};
@@ -646,72 +529,5 @@ mod tests {
             seen += 1;
         }
         assert!(seen > 30);
-    }
-
-    /// The plainest possible blend of one spot.
-    fn reference(drawn: &[([f32; 3], f32)]) -> Option<[f32; 3]> {
-        let mut reference = f32::INFINITY;
-        let mut color = None;
-        for _ in 0..=ROUNDS {
-            let (mut sum, mut total) = ([0.0_f32; 3], 0.0);
-            for (color, weight) in drawn {
-                let brighter = (luma(*color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
-                let weight = weight / (1.0 + brighter * brighter);
-                for (sum, channel) in sum.iter_mut().zip(color) {
-                    *sum += weight * channel;
-                }
-                total += weight;
-            }
-            if total < 1e-12 {
-                return None;
-            }
-            let mean = sum.map(|s| s / total);
-            reference = luma(mean);
-            color = Some(mean);
-        }
-        color
-    }
-
-    #[test]
-    fn blending_equals_its_plain_twin() {
-        let mut random = rand_chacha::ChaCha8Rng::seed_from_u64(3);
-        let example = Example::new(&[(4.0, 0.0), (-4.0, 1.0), (1.0, 5.0), (0.0, -5.0)], [1.0; 3], (0.0, 0.0));
-        let mut bench = blended(&example);
-        let (spots, speakers) = (bench.spots.len(), bench.speakers.len());
-        assert!(spots > 9 && speakers > 2);
-        bench.drawn.clear(spots, speakers);
-        for speaker in 0..speakers {
-            for k in 0..spots {
-                let at = speaker * bench.drawn.pitch + k;
-                if k != 4 && random.random_bool(0.7) {
-                    let color: [f32; 3] = [random.random_range(20.0..200.0), random.random_range(20.0..200.0), 60.0];
-                    for (plane, channel) in bench.drawn.color.iter_mut().zip(color) {
-                        plane[at] = channel;
-                    }
-                    bench.drawn.luma[at] = luma(color);
-                    bench.drawn.weight[at] = random.random_range(0.01..1.0);
-                }
-            }
-        }
-        bench.blended.clear();
-        wide::run(Blend(&mut bench));
-        assert_eq!(bench.blended.len(), spots);
-        for k in 0..spots {
-            let of = |speaker: usize| {
-                let at = speaker * bench.drawn.pitch + k;
-                ([0, 1, 2].map(|c| bench.drawn.color[c][at]), bench.drawn.weight[at])
-            };
-            let expected = reference(&(0..speakers).map(of).collect::<Vec<_>>());
-            match (bench.blended[k], expected) {
-                (None, None) => {}
-                (Some(found), Some(expected)) => {
-                    for (found, expected) in found.color.into_iter().zip(expected) {
-                        assert!((found - expected).abs() < 0.02, "{k}: {found} for {expected}");
-                    }
-                }
-                (found, expected) => panic!("{k}: {found:?} for {expected:?}"),
-            }
-        }
-        assert!(bench.blended[4].is_none());
     }
 }

@@ -7,7 +7,7 @@
 //! 2. [`live`] and [`view_fit`]: each of these views, drawn small over the good pixels around the holes, gives its brightness against
 //!    the live picture (the lamp rides on the camera, so views differ from place to place), the small shift that is left, and how
 //!    well it then fits: three smooth fields by normalized convolution (Knutsson and Westin 1993);
-//! 3. [`blend`]: the views drawn in full over the holes, [`lookup`] by [`lookup`], and blended, the darker heard rather than the
+//! 3. [`blend`], [`drawing`] and [`drawn`]: the views drawn in full over the holes, [`lookup`] by [`lookup`], and blended, the darker heard rather than the
 //!    brighter, since the lamp only adds light;
 //! 4. [`replacement`]: the picture replaced where it is *brighter* than what was measured: the seam lies where both agree, so it
 //!    cannot be seen.
@@ -17,6 +17,7 @@
 pub mod blend;
 pub mod camera_blending;
 pub mod drawing;
+pub mod drawn;
 pub mod ensemble;
 #[cfg(test)]
 pub mod example;
