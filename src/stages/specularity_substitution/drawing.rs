@@ -297,7 +297,7 @@ impl Bench {
             return None;
         }
         // The middle of the small pixel; (x, y) is the pixel right below it.
-        let middle = if scene.grid.step % 2 == 0 { 0.5 } else { 0.0 };
+        let middle = if scene.grid.step.is_multiple_of(2) { 0.5 } else { 0.0 };
         let (x, y) = (x as f32 - middle, y as f32 - middle);
         let (fx, fy) = block.share_of(x, y);
         let (mut sum, mut clean) = (0.0, 0);
