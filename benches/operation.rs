@@ -1,5 +1,6 @@
 //! A simulated operation at 1080p: its pictures, its arm, and a light field as good as truth allows.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use endofield::camera::intrinsics::Pixel;
@@ -11,8 +12,11 @@ use endofield::geometry::space::{Camera, Hand, RobotBase, World};
 use endofield::geometry::transform::Transform;
 use endofield::image::buffer::{Image, Rgb8};
 use endofield::image::pool::Pool;
+use endofield::light_field::file;
 use endofield::light_field::view::{LightField, View};
+use endofield::media::reader::{Input, VideoReader};
 use endofield::pipeline::stage::{Source, SourceError};
+use endofield::progress::Silent;
 use endofield::recording::folder::{Recording, Video};
 use endofield::robot::hand_eye::HandEye;
 use endofield::robot::trajectory::{TimedPose, Trajectory as ArmTrajectory};
@@ -30,6 +34,8 @@ const PICTURES: usize = 12;
 /// Of the light field.
 const VIEWS: usize = 8;
 const PERIOD_S: f64 = 0.04;
+/// Of a recording.
+const RECORDED: usize = 40;
 /// Every so many pixels a vertex of the surface.
 const MESH_STEP_PX: usize = 16;
 
@@ -47,6 +53,10 @@ pub struct Operation {
     pub light_field: Arc<LightField>,
     /// The live pictures, in order.
     pub pictures: Arc<Vec<Image<Rgb8>>>,
+    /// Size of the pictures, px.
+    pub size: (usize, usize),
+    /// When each picture was taken; none for pictures that are played there and back.
+    pub times: Option<Arc<Vec<Timestamp>>>,
 }
 
 impl Operation {
@@ -75,6 +85,32 @@ impl Operation {
             recording,
             light_field: Arc::new(light_field),
             pictures: Arc::new(live.into_iter().map(|(_, picture, _)| picture).collect()),
+            size: SIZE,
+            times: None,
+        }
+    }
+
+    /// A recording and its light field, from their folders; the first frames only. `enlargement` is by how much its pictures (not its
+    /// views) are made larger.
+    pub fn recorded(recording: &Path, light_field: &Path, enlargement: usize) -> Self {
+        let mut recording = Recording::open(recording).expect("a recording");
+        let input = Input::from_argument(recording.video.path());
+        let mut reader = VideoReader::open(&input).expect("a video");
+        let pool = Pool::new(1);
+        let (mut pictures, mut times) = (Vec::new(), Vec::new());
+        while let (true, Ok(Some(frame))) = (pictures.len() < RECORDED, reader.next_frame(&pool)) {
+            let exact = recording.frame_times.as_ref().and_then(|times| times.get(pictures.len()));
+            times.push(exact.copied().unwrap_or(frame.timestamp));
+            pictures.push(enlarged(&frame.image, enlargement));
+        }
+        recording.camera = recording.camera.map(|camera| camera.scaled(enlargement as f64));
+        let light_field = file::read(light_field, &Silent).expect("a light field").light_field;
+        Self {
+            size: pictures.first().map_or((0, 0), Image::size),
+            recording,
+            light_field: Arc::new(light_field),
+            pictures: Arc::new(pictures),
+            times: Some(Arc::new(times)),
         }
     }
 
@@ -82,9 +118,11 @@ impl Operation {
     pub fn source(&self, count: u64) -> ThereAndBack {
         ThereAndBack {
             pictures: Arc::clone(&self.pictures),
+            times: self.times.clone(),
+            camera: self.times.as_ref().and_then(|_| self.recording.camera.clone().map(Arc::new)),
             pool: Pool::new(32),
             next: 0,
-            count,
+            count: self.times.as_ref().map_or(count, |times| count.min(times.len() as u64)),
         }
     }
 }
@@ -92,6 +130,8 @@ impl Operation {
 /// Plays pictures forth and back, so that neighbouring frames are neighbours in space.
 pub struct ThereAndBack {
     pictures: Arc<Vec<Image<Rgb8>>>,
+    times: Option<Arc<Vec<Timestamp>>>,
+    camera: Option<Arc<CameraModel>>,
     pool: Pool<Rgb8>,
     next: u64,
     count: u64,
@@ -104,11 +144,38 @@ impl Source for ThereAndBack {
         }
         let number = self.next;
         self.next += 1;
-        let at = Timestamp::from_seconds(number as f64 * PERIOD_S);
-        let mut frame = Frame::new(FrameId(number), at, at, self.pool.take_copy(&self.pictures[shown(number)]));
+        let (at, picture) = match &self.times {
+            Some(times) => (times[number as usize], number as usize),
+            None => (Timestamp::from_seconds(number as f64 * PERIOD_S), shown(number)),
+        };
+        let mut frame = Frame::new(FrameId(number), at, at, self.pool.take_copy(&self.pictures[picture]));
+        frame.camera.clone_from(&self.camera);
         frame.since_previous = if number == 0 { Span(0) } else { Span::from_seconds(PERIOD_S) };
         Ok(Some(frame))
     }
+}
+
+/// Every pixel repeated, and then smoothed, so that no edges stand between the copies.
+fn enlarged(image: &Image<Rgb8>, by: usize) -> Image<Rgb8> {
+    let (width, height) = (image.width() * by, image.height() * by);
+    let mut out = Image::filled(width, height, [0; 3]);
+    let axis = |at: usize, count: usize| {
+        let place = ((at as f32 + 0.5) / by as f32 - 0.5).clamp(0.0, count as f32 - 1.0);
+        (place as usize, (place as usize + 1).min(count - 1), place.fract())
+    };
+    for y in 0..height {
+        for x in 0..width {
+            let ((x0, x1, fx), (y0, y1, fy)) = (axis(x, image.width()), axis(y, image.height()));
+            let value = |x: usize, y: usize, c: usize| f32::from(image.at(x, y)[c]);
+            let color = std::array::from_fn(|c| {
+                let top = value(x0, y0, c) * (1.0 - fx) + value(x1, y0, c) * fx;
+                let bottom = value(x0, y1, c) * (1.0 - fx) + value(x1, y1, c) * fx;
+                (top * (1.0 - fy) + bottom * fy + 0.5) as u8
+            });
+            out.set(x, y, color);
+        }
+    }
+    out
 }
 
 fn rendered(renderer: &Renderer, course: Course, count: usize, with_truth: bool) -> Vec<(Shot, Image<Rgb8>, Option<Truth>)> {

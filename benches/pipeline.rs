@@ -1,12 +1,13 @@
 //! How fast the whole line is on this machine: 1080p frames of a simulated operation through every stage.
 //!
-//! `cargo bench --bench pipeline [-- [FRAMES] [--front] [--json FILE]]`, 200 frames unless told, fewer
+//! `cargo bench --bench pipeline [-- [FRAMES] [--front] [--json FILE] [--recording FOLDER --light-field FOLDER [--enlarge N]]]`, 200 frames unless told, fewer
 //! where they would take longer than a quarter of a minute. Three tables:
 //!
 //! 1. each stage alone on one core: processor time a frame, which does not depend on what else the machine does;
 //! 2. the line as it runs, one thread a stage over rayon's pool: wall time a frame and stage, and frames per second;
 //! 3. the pixel kernels, each alone on one core.
 //!
+//! `--recording FOLDER --light-field FOLDER` plays the first frames of a recording instead, `--enlarge 2` at twice its size.
 //! `--front` leaves the substitution out. Decoding and encoding are not in it; `endofield process --report` measures them too.
 #![expect(
     clippy::print_stdout,
@@ -15,6 +16,7 @@
     reason = "it is its own harness"
 )]
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use endofield::compose::{self, Choice, Equipment, Line};
@@ -33,7 +35,7 @@ mod measure;
 mod operation;
 
 use measure::{cpu_ms, median, timed};
-use operation::{Operation, SIZE};
+use operation::Operation;
 
 /// Frames for table 1, of which the first few only warm up.
 const FRAMES_ON_ONE_CORE: u64 = 20;
@@ -69,7 +71,7 @@ fn line(operation: &Operation, front: Front) -> Line {
     let equipment = Equipment {
         recording: &operation.recording,
         light_field: Some(Arc::clone(&operation.light_field)),
-        size: SIZE,
+        size: operation.size,
     };
     let mut line = compose::line(&config, &Choice::ALL, &equipment).expect("the default line stands");
     if front == Front::Alone {
@@ -168,18 +170,28 @@ fn main() {
     let mut count = 200;
     let mut front = Front::WithSubstitution;
     let mut json = None;
+    let (mut recording, mut light_field, mut enlargement) = (None, None, 1);
     // Cargo adds `--bench`.
     let mut arguments = std::env::args().skip(1).filter(|argument| argument != "--bench");
     while let Some(argument) = arguments.next() {
         if argument == "--json" {
             json = arguments.next();
+        } else if argument == "--recording" {
+            recording = arguments.next().map(PathBuf::from);
+        } else if argument == "--light-field" {
+            light_field = arguments.next().map(PathBuf::from);
+        } else if argument == "--enlarge" {
+            enlargement = arguments.next().and_then(|by| by.parse().ok()).unwrap_or(1);
         } else if argument == "--front" {
             front = Front::Alone;
         } else if let Ok(number) = argument.parse::<u64>() {
             count = number;
         }
     }
-    let operation = Operation::simulated(count.max(FRAMES_ON_ONE_CORE));
+    let operation = match recording.zip(light_field) {
+        Some((recording, light_field)) => Operation::recorded(&recording, &light_field, enlargement),
+        None => Operation::simulated(count.max(FRAMES_ON_ONE_CORE)),
+    };
     let one_core = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
     let alone = one_core.install(|| on_one_core(&operation, front));
     let kernels = one_core.install(|| kernels::timings(&operation));
@@ -196,7 +208,7 @@ fn main() {
     let (all, others) = (sum(|_| true), sum(|stage| stage != SUBSTITUTION));
     println!("{:<28}{all:>9.2}", "all");
     println!("{:<28}{others:>9.2}", "all but the substitution");
-    print_whole(&whole);
+    print_whole(&whole, operation.size);
     println!("\n{:<28}{:>9}", "ms a kernel on one core", "fastest");
     for (name, ms) in &kernels {
         println!("{name:<28}{ms:>9.2}");
@@ -206,7 +218,7 @@ fn main() {
             rows.into_iter().map(|(name, ms)| (name.to_owned(), ms.into())).collect()
         };
         let report = serde_json::json!({
-            "size": SIZE,
+            "size": operation.size,
             "stage_ms_on_one_core": fields(alone.iter().map(|row| (row.stage, row.median)).collect()),
             "kernel_ms_on_one_core": fields(kernels.iter().map(|row| (row.0.as_str(), row.1)).collect()),
             "fps": whole.outcome.frames_out as f64 / whole.seconds,
@@ -217,7 +229,7 @@ fn main() {
     }
 }
 
-fn print_whole(whole: &Whole) {
+fn print_whole(whole: &Whole, size: (usize, usize)) {
     let row = |name: &str, times: &Summary| {
         println!(
             "{name:<28}{:>9.2}{:>9.2}{:>9.2}{:>9.2}",
@@ -240,8 +252,8 @@ fn print_whole(whole: &Whole) {
     let frames = outcome.frames_out as f64;
     println!(
         "\n{frames} frames of {}x{} in {:.1} s: {:.1} fps on {} threads; {:.1} ms of processor time a frame; memory at its peak: {}",
-        SIZE.0,
-        SIZE.1,
+        size.0,
+        size.1,
         whole.seconds,
         frames / whole.seconds,
         threads(),

@@ -27,6 +27,20 @@ impl Mapping {
         })
     }
 
+    /// The same mapping onto a picture of the view of which each pixel is `step` × `step` of the view's.
+    pub fn onto_coarser(&self, step: f32) -> Self {
+        let mut coarser = *self;
+        // (u + ½) / step − ½
+        let (scale, shift) = (1.0 / step, 0.5 / step - 0.5);
+        for i in 0..2 {
+            for j in 0..3 {
+                coarser.m[i][j] = scale * self.m[i][j] + shift * self.m[2][j];
+            }
+            coarser.b[i] = scale * self.b[i] + shift * self.b[2];
+        }
+        coarser
+    }
+
     /// Column, row and depth in the view.
     #[inline]
     pub fn apply(&self, x: f32, y: f32, z: f32) -> (f32, f32, f32) {

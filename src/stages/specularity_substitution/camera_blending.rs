@@ -3,14 +3,12 @@
 //! The unstructured lumigraph (Buehler et al. 2001) calls this the camera blending field: weights at the vertices of a lattice,
 //! interpolated over its faces, so that a view fades in and out and makes no seam.
 
-use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-use crate::camera::model::CameraModel;
-use crate::light_field::mapping::{Mapping, is_unoccluded};
-use crate::light_field::view::View;
+use crate::stages::specularity_substitution::ensemble::{Ensemble, MOST_MEMBERS};
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid};
 use crate::stages::specularity_substitution::scene::Scene;
+use crate::stages::specularity_substitution::sight::{Place, Sight, Views};
 
 /// At most so many views speak at a corner.
 pub const MAX_VIEWS: usize = 8;
@@ -33,9 +31,6 @@ const WORTH_OF_A_GLIMPSE: f32 = 0.3;
 /// A view that speaks at a neighbouring corner already costs this much less, rad: fewer views are drawn, and they change less often.
 const WORTH_OF_COMPANY: f32 = 0.08;
 
-/// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
-const HEARD_FROM: u8 = 120;
-
 /// Cells around a corner that its views should see.
 const SUPPORT: usize = CELLS_PER_BLOCK;
 
@@ -53,6 +48,8 @@ pub struct Voice {
 pub struct Corner {
     voices: [Voice; MAX_VIEWS],
     count: usize,
+    /// A bit for every member of the ensemble that speaks.
+    members: u64,
 }
 
 impl Corner {
@@ -61,35 +58,25 @@ impl Corner {
         &self.voices[..self.count]
     }
 
-    fn speaks(&self, view: u16) -> bool {
-        self.voices().iter().any(|v| v.view == view)
+    fn has(&self, member: usize) -> bool {
+        self.members >> member & 1 != 0
     }
-}
-
-/// A pixel of a hole, standing for a quarter of its cell.
-#[derive(Clone, Copy, Debug, Default)]
-struct Place {
-    x: f32,
-    y: f32,
-    /// mm; 0 where the quarter has no hole.
-    depth: f32,
 }
 
 /// Places of a cell: what a view sees clean between two lobes may be no wider than half a cell.
 const PLACES_PER_CELL: usize = 4;
 
-/// How a view sees a place.
-const UNSEEN: u8 = 0;
-const HAZY: u8 = 1;
-const CLEAN: u8 = 2;
-
 /// The choice for one frame; keeps its memory.
 #[derive(Debug, Default)]
 pub struct CameraBlending {
+    /// A pixel for every quarter of a cell.
     places: Vec<Place>,
-    sights: Vec<u8>,
+    /// One for every block with a hole.
+    samples: Vec<Place>,
+    ensemble: Ensemble,
+    /// Per place, per member of the ensemble.
+    sights: Vec<Sight>,
     corners: Vec<Corner>,
-    penalties: Vec<f32>,
 }
 
 impl CameraBlending {
@@ -103,45 +90,31 @@ impl CameraBlending {
         &self.corners
     }
 
-    /// Choose for the frame. `mappings` holds one entry a view, `None` where it cannot see the frame.
+    /// Forget the last frame.
+    pub fn forget(&mut self) {
+        self.ensemble.forget();
+    }
+
+    /// Choose for the frame, at most `limit` views in all; `holes` is 1 for every cell with a pixel that may be replaced.
     ///
     /// The lamp's image moves little between neighbouring views, so the best views by angle are often dazzled at the very place that is
     /// asked for: views are taken one by one, each for its angle and for the places that too few of those before it saw.
-    pub fn choose(&mut self, scene: &Scene<'_>, mappings: &[Option<Mapping>]) {
-        self.find_places(scene);
-        self.look(scene, mappings);
+    pub fn choose(&mut self, scene: &Scene<'_>, holes: &[u8], views: &Views<'_>, limit: usize) {
+        self.find_places(scene, holes);
+        self.ensemble.gather(views, &self.samples, limit);
+        self.look(views);
         let (across, down) = scene.grid.blocks();
-        let views = mappings.len();
-        self.penalties.clear();
-        self.penalties.resize((across + 1) * (down + 1) * views, f32::INFINITY);
-        let places = &self.places;
-        self.penalties
-            .par_chunks_mut(((across + 1) * views).max(1))
-            .enumerate()
-            .for_each(|(j, row)| {
-                for (i, penalties) in row.chunks_mut(views.max(1)).enumerate() {
-                    let Some(place) = places_around(scene.grid, i, j).map(|p| places[p]).find(|p| p.depth > 0.0) else {
-                        continue;
-                    };
-                    let point = world_point(scene, place);
-                    for ((penalty, view), mapping) in penalties.iter_mut().zip(&scene.light_field.views).zip(mappings) {
-                        *penalty = mapping
-                            .as_ref()
-                            .map_or(f32::INFINITY, |m| penalty_of(view, m, scene, place, &point));
-                    }
-                }
-            });
         self.corners.clear();
         for j in 0..=down {
             for i in 0..=across {
-                let corner = self.choose_at(scene.grid, i, j, views);
+                let corner = self.choose_at(scene.grid, views, i, j);
                 self.corners.push(corner);
             }
         }
     }
 
     /// A pixel for every quarter of a cell with a hole: the specular one nearest to the quarter's middle, else the one nearest to the mask.
-    fn find_places(&mut self, scene: &Scene<'_>) {
+    fn find_places(&mut self, scene: &Scene<'_>, holes: &[u8]) {
         let grid = scene.grid;
         self.places.clear();
         self.places.resize(grid.count() * PLACES_PER_CELL, Place::default());
@@ -152,31 +125,42 @@ impl CameraBlending {
                 for (index, place) in places.iter_mut().enumerate() {
                     let half = grid.cell / 2;
                     let (column, quarter) = (index / PLACES_PER_CELL, index % PLACES_PER_CELL);
+                    if holes[row * grid.across + column] == 0 {
+                        continue;
+                    }
                     let (left, top) = (column * grid.cell + quarter % 2 * half, row * grid.cell + quarter / 2 * half);
                     *place = place_in(scene, left, top, half);
                 }
             });
+        self.samples.clear();
+        let (across, down) = grid.blocks();
+        for (i, j) in (0..down).flat_map(|j| (0..across).map(move |i| (i, j))) {
+            let places = places_of_block(grid, i, j).map(|p| self.places[p]).filter(|p| p.depth > 0.0);
+            // The one nearest to the mask stands for all.
+            self.samples
+                .extend(places.min_by_key(|p| scene.distance.at(p.x as usize, p.y as usize)));
+        }
     }
 
-    /// How every view sees every place.
-    fn look(&mut self, scene: &Scene<'_>, mappings: &[Option<Mapping>]) {
-        let views = mappings.len();
+    /// How every member sees every place.
+    fn look(&mut self, views: &Views<'_>) {
+        let members = self.ensemble.members();
         self.sights.clear();
-        self.sights.resize(self.places.len() * views, UNSEEN);
+        self.sights.resize(self.places.len() * members.len(), Sight::Unseen);
         self.sights
-            .par_chunks_mut(views.max(1))
+            .par_chunks_mut(members.len().max(1))
             .zip(&self.places)
             .with_min_len(256)
             .for_each(|(sights, place)| {
                 if place.depth > 0.0 {
-                    for ((sight, mapping), view) in sights.iter_mut().zip(mappings).zip(&scene.light_field.views) {
-                        *sight = mapping.as_ref().map_or(UNSEEN, |m| sight_of(view, m, *place));
+                    for (sight, &view) in sights.iter_mut().zip(members) {
+                        *sight = views.sight(view, *place);
                     }
                 }
             });
     }
 
-    fn choose_at(&self, grid: Grid, i: usize, j: usize, views: usize) -> Corner {
+    fn choose_at(&self, grid: Grid, views: &Views<'_>, i: usize, j: usize) -> Corner {
         let mut corner = Corner::default();
         let holes = gather(grid, i, j, &self.places);
         if holes.count == 0 {
@@ -184,21 +168,32 @@ impl CameraBlending {
         }
         let places = &holes.index[..holes.count];
         let across = Self::corners_across(grid);
-        let neighbours = [
-            (i > 0).then(|| &self.corners[j * across + i - 1]),
-            (j > 0).then(|| &self.corners[(j - 1) * across + i]),
-            (i > 0 && j > 0).then(|| &self.corners[(j - 1) * across + i - 1]),
-            (j > 0 && i + 1 < across).then(|| &self.corners[(j - 1) * across + i + 1]),
+        let before = [
+            (i > 0).then(|| j * across + i - 1),
+            (j > 0).then(|| (j - 1) * across + i),
+            (i > 0 && j > 0).then(|| (j - 1) * across + i - 1),
+            (j > 0 && i + 1 < across).then(|| (j - 1) * across + i + 1),
         ];
-        let penalties = &self.penalties[(j * across + i) * views..][..views];
-        let bits = |view: usize, least: u8| -> u64 {
-            let seen = |(bit, &place): (usize, &usize)| u64::from(self.sights[place * views + view] >= least) << bit;
-            places.iter().enumerate().map(seen).sum()
-        };
+        let company = (before.into_iter().flatten()).fold(0, |all, corner| all | self.corners[corner].members);
+        let members = self.ensemble.members();
+        let first = self.places[places[0]];
+        // Per member: its penalty, and a bit for every place that it sees clean, and that it sees at all.
+        let mut penalties = [f32::INFINITY; MOST_MEMBERS];
+        for (penalty, &view) in penalties.iter_mut().zip(members) {
+            *penalty = views.penalty(view, first);
+        }
+        let (mut clean, mut seen) = ([0_u64; MOST_MEMBERS], [0_u64; MOST_MEMBERS]);
+        for (bit, &place) in places.iter().enumerate() {
+            let sights = &self.sights[place * members.len()..][..members.len()];
+            for ((clean, seen), &sight) in clean.iter_mut().zip(&mut seen).zip(sights) {
+                *clean |= u64::from(sight == Sight::Clean) << bit;
+                *seen |= u64::from(sight != Sight::Unseen) << bit;
+            }
+        }
         let all = u64::MAX >> (u64::BITS as usize - places.len());
-        let could_be_seen = (penalties.iter().enumerate())
-            .filter(|(_, penalty)| penalty.is_finite())
-            .fold(0, |seen, (view, _)| seen | bits(view, CLEAN));
+        let could_be_seen = (penalties.iter().zip(&clean))
+            .filter(|(penalty, _)| penalty.is_finite())
+            .fold(0, |all, (_, clean)| all | clean);
         // Places seen so often, and places that were glimpsed twice.
         let mut wanted = [all, 0, 0];
         let (mut glimpsed, mut glimpsed_twice) = (0_u64, 0_u64);
@@ -213,42 +208,41 @@ impl CameraBlending {
             if total == 0.0 || !still_to_be_seen && corner.count >= ENOUGH_VIEWS {
                 break;
             }
-            let mut best: Option<(f32, u16, u64, u64)> = None;
-            for (view, &penalty) in penalties.iter().enumerate() {
-                if !penalty.is_finite() || corner.speaks(view as u16) {
+            let mut best: Option<(f32, usize)> = None;
+            for member in 0..members.len() {
+                let (penalty, clean, seen) = (penalties[member], clean[member], seen[member]);
+                if !penalty.is_finite() || seen == 0 || corner.has(member) {
                     continue;
                 }
-                let (clean, hazy) = (bits(view, CLEAN), bits(view, HAZY));
-                if hazy == 0 {
-                    continue;
-                }
-                let mut worth = WORTH_OF_A_GLIMPSE * (hazy & !clean & unseen).count_ones() as f32;
+                let mut worth = WORTH_OF_A_GLIMPSE * (seen & !clean & unseen).count_ones() as f32;
                 for (wanted, next) in wanted.iter().zip(WORTH_OF_NEXT) {
                     worth += next * (clean & wanted).count_ones() as f32;
                 }
-                let company = neighbours.iter().flatten().any(|n| n.speaks(view as u16));
-                let cost = penalty - SIGHTING_WORTH * worth / total - if company { WORTH_OF_COMPANY } else { 0.0 };
+                let cost =
+                    penalty - SIGHTING_WORTH * worth / total - if company >> member & 1 != 0 { WORTH_OF_COMPANY } else { 0.0 };
                 if best.is_none_or(|b| cost < b.0) {
-                    best = Some((cost, view as u16, clean, hazy));
+                    best = Some((cost, member));
                 }
             }
             // Places that no view saw stay unseen: nothing more is gained for them.
-            let Some((_, view, clean, hazy)) = best else { break };
+            let Some((_, member)) = best else { break };
+            let (clean, seen) = (clean[member], seen[member]);
             for step in (0..WANTED_SIGHTINGS).rev() {
-                let seen = wanted[step] & clean;
-                wanted[step] &= !seen;
+                let newly = wanted[step] & clean;
+                wanted[step] &= !newly;
                 if let Some(next) = wanted.get_mut(step + 1) {
-                    *next |= seen;
+                    *next |= newly;
                 }
             }
-            glimpsed_twice |= glimpsed & hazy;
-            glimpsed |= hazy;
+            glimpsed_twice |= glimpsed & seen;
+            glimpsed |= seen;
             // Until the threshold is known the weight holds the penalty.
             corner.voices[corner.count] = Voice {
-                view,
-                weight: penalties[usize::from(view)],
+                view: members[member],
+                weight: penalties[member],
             };
             corner.count += 1;
+            corner.members |= 1 << member;
         }
         // Buehler 2001: weights fall to zero at a threshold; here beyond the worst view that was needed.
         let threshold = 1.3 * corner.voices().iter().map(|v| v.weight).fold(0.01, f32::max);
@@ -312,54 +306,54 @@ pub fn support(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
     rows.flat_map(move |row| columns.clone().map(move |column| row * grid.across + column))
 }
 
+fn places_of_block(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
+    let columns = i * CELLS_PER_BLOCK..((i + 1) * CELLS_PER_BLOCK).min(grid.across);
+    let rows = j * CELLS_PER_BLOCK..((j + 1) * CELLS_PER_BLOCK).min(grid.down);
+    let cells = rows.flat_map(move |row| columns.clone().map(move |column| row * grid.across + column));
+    cells.flat_map(|cell| cell * PLACES_PER_CELL..(cell + 1) * PLACES_PER_CELL)
+}
+
 fn places_around(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
     support(grid, i, j).flat_map(|cell| cell * PLACES_PER_CELL..(cell + 1) * PLACES_PER_CELL)
 }
 
-fn world_point(scene: &Scene<'_>, place: Place) -> Vector3<f64> {
-    let k = &scene.camera.intrinsics;
-    let z = f64::from(place.depth);
-    let point = Point3::new(
-        (f64::from(place.x) - k.cx) / k.fx * z,
-        (f64::from(place.y) - k.cy) / k.fy * z,
-        z,
-    );
-    (scene.eye.isometry() * point).coords
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::stages::specularity_substitution::example::{Example, HOLE};
+    use crate::stages::specularity_substitution::live::Live;
 
-/// Angle between the viewing rays, loss of resolution and nearness to the view's border, rad-like; infinite if not in the view.
-fn penalty_of(view: &View, mapping: &Mapping, scene: &Scene<'_>, place: Place, point: &Vector3<f64>) -> f32 {
-    let (x, y, depth) = mapping.apply(place.x, place.y, place.depth);
-    let margin = border_distance(&view.camera, x, y);
-    if depth <= 0.0 || margin.is_nan() || margin < 0.02 * view.camera.width as f32 {
-        return f32::INFINITY;
+    /// Voices at the corner nearest to the hole's middle.
+    fn voices(example: &Example) -> Vec<Voice> {
+        let (scene, vantages) = (example.scene(), example.vantages());
+        let views = Views {
+            full: &example.light_field.views,
+            vantages: &vantages,
+        };
+        let mut blending = CameraBlending::default();
+        let mut live = Live::default();
+        live.look(&scene);
+        blending.choose(&scene, &live.holes, &views, MOST_MEMBERS);
+        let block = scene.grid.block();
+        let corner = (HOLE.1 / block) * CameraBlending::corners_across(scene.grid) + HOLE.0 / block;
+        blending.corners()[corner].voices().to_vec()
     }
-    let (to_view, to_eye) = (point - view.world_from_camera.translation(), point - scene.eye.translation());
-    let angle = to_view.angle(&to_eye);
-    let resolution = (to_view.norm() / to_eye.norm() - 1.0).max(0.0);
-    let border = margin / (0.1 * view.camera.width as f32);
-    (angle + 0.3 * resolution + 1e-4) as f32 + 0.1 * (1.0 - border).max(0.0)
-}
 
-fn border_distance(camera: &CameraModel, x: f32, y: f32) -> f32 {
-    x.min(y)
-        .min(camera.width as f32 - 1.0 - x)
-        .min(camera.height as f32 - 1.0 - y)
-}
-
-fn sight_of(view: &View, mapping: &Mapping, place: Place) -> u8 {
-    let (x, y, depth) = mapping.apply(place.x, place.y, place.depth);
-    let (width, height) = view.image.size();
-    if !(depth > 0.0 && x >= 1.0 && y >= 1.0 && x < width as f32 - 2.0 && y < height as f32 - 2.0) {
-        return UNSEEN;
+    #[test]
+    fn the_nearest_views_speak_and_the_nearer_the_louder() {
+        let moves: Vec<_> = (0..10).map(|i| (4.0 * (i + 1) as f32, 0.0)).collect();
+        let voices = voices(&Example::new(&moves, [1.0; 3], (0.0, 0.0)));
+        // All see the hole equally well, so the angle decides; three sightings are enough.
+        assert_eq!(voices.iter().map(|v| v.view).collect::<Vec<_>>(), [0, 1, 2]);
+        assert!(voices.windows(2).all(|pair| pair[0].weight > pair[1].weight), "{voices:?}");
     }
-    let (column, row) = ((x + 0.5) as usize, (y + 0.5) as usize);
-    let confidence = view.confidence.at(column, row);
-    if confidence == 0 || !is_unoccluded(view.depth.at(column, row), depth) {
-        UNSEEN
-    } else if confidence < HEARD_FROM {
-        HAZY
-    } else {
-        CLEAN
+
+    #[test]
+    fn a_dazzled_view_does_not_speak_however_near_it_is() {
+        let mut example = Example::new(&[(1.0, 0.0), (6.0, 0.0), (8.0, 0.0), (9.0, 0.0)], [1.0; 3], (0.0, 0.0));
+        example.light_field.views[0].confidence.fill(0);
+        example.look_again();
+        let voices = voices(&example);
+        assert!(!voices.is_empty() && voices.iter().all(|v| v.view != 0), "{voices:?}");
     }
 }

@@ -6,10 +6,12 @@ use crate::image::wide;
 const SMALL_WIDTH_PX: f32 = 480.0;
 /// Pixels of that picture along a cell.
 pub const SMALL_PER_CELL: usize = 4;
-/// Cells along a block; views are chosen at the corners of blocks.
+/// Cells along a block; views are chosen at the corners of blocks, and what is smooth is known block by block.
 pub const CELLS_PER_BLOCK: usize = 2;
+/// Pixels of the small picture along a block.
+pub const SMALL_PER_BLOCK: usize = SMALL_PER_CELL * CELLS_PER_BLOCK;
 
-/// Numbers of a cell, summed and smoothed together.
+/// Numbers of a block, summed and smoothed together.
 pub type Sums = [f32; 8];
 
 /// How a picture is laid out in cells.
@@ -64,17 +66,23 @@ impl Grid {
         (self.across * SMALL_PER_CELL, self.down * SMALL_PER_CELL)
     }
 
-    /// A field at a picture pixel, linear between the centres of cells.
+    /// The block in which a picture pixel lies, row by row.
+    pub fn block_at(&self, x: usize, y: usize) -> usize {
+        y / self.block() * self.blocks().0 + x / self.block()
+    }
+
+    /// A field at a picture pixel, linear between the centres of blocks.
     #[inline]
     pub fn between(&self, field: &[Sums], x: f32, y: f32) -> Sums {
-        let pitch = 1.0 / self.cell as f32;
+        let pitch = 1.0 / self.block() as f32;
+        let (across, down) = self.blocks();
         let axis = |v: f32, count: usize| {
             let place = ((v + 0.5) * pitch - 0.5).clamp(0.0, count as f32 - 1.0);
             let first = place as usize;
             (first, (first + 1).min(count - 1), place - first as f32)
         };
-        let ((x0, x1, fx), (y0, y1, fy)) = (axis(x, self.across), axis(y, self.down));
-        let (top, bottom) = (y0 * self.across, y1 * self.across);
+        let ((x0, x1, fx), (y0, y1, fy)) = (axis(x, across), axis(y, down));
+        let (top, bottom) = (y0 * across, y1 * across);
         let (a, b, c, d) = (&field[top + x0], &field[top + x1], &field[bottom + x0], &field[bottom + x1]);
         let (wa, wb, wc, wd) = ((1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy);
         std::array::from_fn(|i| wa * a[i] + wb * b[i] + wc * c[i] + wd * d[i])
@@ -86,7 +94,7 @@ pub fn step_for(width: usize) -> usize {
     (width as f32 / SMALL_WIDTH_PX).round().max(1.0) as usize
 }
 
-/// A rectangle of cells.
+/// A rectangle of blocks.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Span {
     /// First column.
@@ -113,41 +121,54 @@ impl Span {
         }
     }
 
+    /// True if there is nothing in it.
+    pub fn is_empty(self) -> bool {
+        self.right <= self.left || self.bottom <= self.top
+    }
+
+    /// True if the block lies in it.
+    pub fn holds(self, column: usize, row: usize) -> bool {
+        (self.left..self.right).contains(&column) && (self.top..self.bottom).contains(&row)
+    }
+
     /// Rows of the rectangle.
     pub fn rows(self) -> std::ops::Range<usize> {
         self.top..self.bottom
     }
 
-    /// The part of row `y` of a grid `across` cells wide that lies in the rectangle.
+    /// The part of row `y` of a lattice `across` blocks wide that lies in the rectangle.
     pub fn row(self, y: usize, across: usize) -> std::ops::Range<usize> {
         y * across + self.left..y * across + self.right
     }
 }
 
-/// Adds up cells over their surroundings; keeps its memory.
+/// Adds up blocks over their surroundings; keeps its memory.
 #[derive(Debug, Default)]
 pub struct Smoother {
     rows: Vec<Sums>,
     coarse: Vec<Sums>,
 }
 
-/// Two passes of a box of this radius: standard deviation 2 cells, about 15 px of a 960 px wide picture.
+/// Weights of a block and its neighbours along an axis: standard deviation 1 block, about 15 px of a 960 px wide picture.
+const NEAR: [f32; 5] = [0.0625, 0.25, 0.375, 0.25, 0.0625];
+/// The far mean is taken over blocks this many times as long …
+const COARSER: usize = 2;
+/// … by two passes of a box of this radius.
 const RADIUS: usize = 2;
-/// The far mean is taken over cells this many times as long.
-const COARSER: usize = 4;
-/// Weight of the far mean against a cell full of good pixels.
+/// Weight of the far mean against a block full of good pixels.
 const FAR_WEIGHT: f32 = 0.02;
 
 impl Smoother {
-    /// Replace every cell of `span` by a weighted sum over its surroundings; what is near outweighs what is far where there is something
-    /// near. Cells out of `span` must be empty.
-    pub fn smooth(&mut self, grid: Grid, span: Span, cells: &mut [Sums]) {
-        let (across, down) = (grid.across.div_ceil(COARSER), grid.down.div_ceil(COARSER));
+    /// Replace every block of `span` by a weighted sum over its surroundings; what is near outweighs what is far where there is something
+    /// near. Blocks out of `span` count as empty.
+    pub fn smooth(&mut self, grid: Grid, span: Span, blocks: &mut [Sums]) {
+        let (blocks_across, blocks_down) = grid.blocks();
+        let (across, down) = (blocks_across.div_ceil(COARSER), blocks_down.div_ceil(COARSER));
         self.coarse.clear();
         self.coarse.resize(across * down, [0.0; 8]);
         for y in span.rows() {
-            for (x, cell) in (span.left..span.right).zip(&cells[span.row(y, grid.across)]) {
-                add(&mut self.coarse[y / COARSER * across + x / COARSER], cell, 1.0);
+            for (x, block) in (span.left..span.right).zip(&blocks[span.row(y, blocks_across)]) {
+                add(&mut self.coarse[y / COARSER * across + x / COARSER], block, 1.0);
             }
         }
         let all = Span {
@@ -156,26 +177,31 @@ impl Smoother {
             right: across,
             bottom: down,
         };
-        self.rows.resize(cells.len(), [0.0; 8]);
+        self.rows.resize(blocks.len(), [0.0; 8]);
         for _ in 0..2 {
             box_mean(&mut self.coarse, across, all, &mut self.rows);
-            box_mean(cells, grid.across, span, &mut self.rows);
         }
+        wide::run(NearMean {
+            blocks,
+            across: blocks_across,
+            span,
+            rows: &mut self.rows,
+        });
         for y in span.rows() {
             let (y0, y1, fy) = neighbours(y, down);
-            for (x, cell) in (span.left..span.right).zip(&mut cells[span.row(y, grid.across)]) {
+            for (x, block) in (span.left..span.right).zip(&mut blocks[span.row(y, blocks_across)]) {
                 let (x0, x1, fx) = neighbours(x, across);
                 let weight = FAR_WEIGHT / (COARSER * COARSER) as f32;
                 for (row, wy) in [(y0, 1.0 - fy), (y1, fy)] {
-                    add(cell, &self.coarse[row * across + x0], weight * wy * (1.0 - fx));
-                    add(cell, &self.coarse[row * across + x1], weight * wy * fx);
+                    add(block, &self.coarse[row * across + x0], weight * wy * (1.0 - fx));
+                    add(block, &self.coarse[row * across + x1], weight * wy * fx);
                 }
             }
         }
     }
 }
 
-/// The two coarse cells whose middles lie around a fine cell's, and how near it is to the second.
+/// The two coarse blocks whose middles lie around a fine one's, and how near it is to the second.
 fn neighbours(fine: usize, count: usize) -> (usize, usize, f32) {
     let place = ((fine as f32 + 0.5) / COARSER as f32 - 0.5).clamp(0.0, count as f32 - 1.0);
     let first = place as usize;
@@ -241,7 +267,47 @@ impl wide::Kernel for BoxMean<'_> {
     }
 }
 
-#[inline]
+/// The mean over the neighbourhood that [`NEAR`] weighs, within a span.
+struct NearMean<'a> {
+    blocks: &'a mut [Sums],
+    across: usize,
+    span: Span,
+    rows: &'a mut [Sums],
+}
+
+impl wide::Kernel for NearMean<'_> {
+    #[inline(always)]
+    fn run(self) {
+        for y in self.span.rows() {
+            let source = &self.blocks[self.span.row(y, self.across)];
+            let out = &mut self.rows[self.span.row(y, self.across)];
+            for (x, out) in out.iter_mut().enumerate() {
+                let mut sum = [0.0; 8];
+                for (weight, place) in NEAR.iter().zip(x..) {
+                    // Two to the left up to two to the right; what is left of the row wraps round and is not found.
+                    if let Some(block) = source.get(place.wrapping_sub(2)) {
+                        add(&mut sum, block, *weight);
+                    }
+                }
+                *out = sum;
+            }
+        }
+        for y in self.span.rows() {
+            let out = &mut self.blocks[self.span.row(y, self.across)];
+            out.fill([0.0; 8]);
+            for (weight, place) in NEAR.iter().zip(y..) {
+                let row = place.wrapping_sub(2);
+                if self.span.rows().contains(&row) {
+                    for (out, block) in out.iter_mut().zip(&self.rows[self.span.row(row, self.across)]) {
+                        add(out, block, *weight);
+                    }
+                }
+            }
+        }
+    }
+}
+
+#[inline(always)]
 fn add(sum: &mut Sums, cell: &Sums, factor: f32) {
     for (sum, value) in sum.iter_mut().zip(cell) {
         *sum += factor * value;
@@ -253,36 +319,86 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_field_is_linear_between_the_centres_of_cells() {
+    fn a_field_is_linear_between_the_centres_of_blocks() {
         let grid = Grid::over((96, 64));
-        let field: Vec<Sums> = (0..grid.count())
-            .map(|i| [((i % grid.across) * grid.cell) as f32 + 0.5 * grid.cell as f32 - 0.5; 8])
+        let (across, down) = grid.blocks();
+        let field: Vec<Sums> = (0..across * down)
+            .map(|i| [((i % across) * grid.block()) as f32 + 0.5 * grid.block() as f32 - 0.5; 8])
             .collect();
         for x in [10.0, 31.5, 60.0] {
             assert!((grid.between(&field, x, 20.0)[3] - x).abs() < 1e-3);
         }
     }
 
-    #[test]
-    fn smoothing_keeps_a_constant_ratio_and_fills_empty_cells_from_afar() {
-        let grid = Grid::over((960, 540));
-        let mut cells = vec![[0.0; 8]; grid.count()];
-        for y in 20..24 {
-            for x in 20..24 {
-                cells[y * grid.across + x] = [2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-            }
-        }
-        let all = Span {
+    fn everywhere(grid: Grid) -> Span {
+        Span {
             left: 0,
             top: 0,
-            right: grid.across,
-            bottom: grid.down,
-        };
-        Smoother::default().smooth(grid, all, &mut cells);
-        for (x, y) in [(21, 21), (26, 22), (34, 24)] {
-            let cell = cells[y * grid.across + x];
-            assert!(cell[0] > 0.0 && (cell[1] / cell[0] - 1.5).abs() < 1e-3, "{x} {y} {cell:?}");
+            right: grid.blocks().0,
+            bottom: grid.blocks().1,
         }
-        assert!(cells[21 * grid.across + 21][0] > 100.0 * cells[24 * grid.across + 34][0]);
+    }
+
+    #[test]
+    fn smoothing_keeps_a_constant_ratio_and_fills_empty_blocks_from_afar() {
+        let grid = Grid::over((960, 540));
+        let (across, down) = grid.blocks();
+        let mut blocks = vec![[0.0; 8]; across * down];
+        for y in 10..12 {
+            for x in 10..12 {
+                blocks[y * across + x] = [2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+            }
+        }
+        Smoother::default().smooth(grid, everywhere(grid), &mut blocks);
+        for (x, y) in [(10, 10), (13, 11), (17, 12)] {
+            let block = blocks[y * across + x];
+            assert!(
+                block[0] > 0.0 && (block[1] / block[0] - 1.5).abs() < 1e-3,
+                "{x} {y} {block:?}"
+            );
+        }
+        assert!(blocks[10 * across + 10][0] > 100.0 * blocks[12 * across + 17][0]);
+    }
+
+    /// The plainest possible mean near a block.
+    fn reference_near(blocks: &[Sums], across: usize, span: Span, column: usize, row: usize) -> f32 {
+        let mut sum = 0.0;
+        for v in span.rows() {
+            for u in span.left..span.right {
+                if u.abs_diff(column) <= 2 && v.abs_diff(row) <= 2 {
+                    sum += NEAR[u + 2 - column] * NEAR[v + 2 - row] * blocks[v * across + u][5];
+                }
+            }
+        }
+        sum
+    }
+
+    #[test]
+    fn the_near_mean_equals_its_plain_twin() {
+        let grid = Grid::over((480, 200));
+        let (across, down) = grid.blocks();
+        let span = Span {
+            left: 3,
+            top: 1,
+            right: across - 2,
+            bottom: down - 1,
+        };
+        let before: Vec<Sums> = (0..across * down).map(|i| [(i * 7919 % 101) as f32; 8]).collect();
+        let (mut blocks, mut rows) = (before.clone(), before.clone());
+        wide::run(NearMean {
+            blocks: &mut blocks,
+            across,
+            span,
+            rows: &mut rows,
+        });
+        for y in span.rows() {
+            for x in span.left..span.right {
+                let expected = reference_near(&before, across, span, x, y);
+                assert!(
+                    (blocks[y * across + x][5] - expected).abs() < 1e-3 * expected.max(1.0),
+                    "({x}, {y})"
+                );
+            }
+        }
     }
 }

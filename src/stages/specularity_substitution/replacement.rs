@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::frame::provenance_code;
 use crate::image::buffer::{Image, Rgb8};
-use crate::stages::specularity_substitution::blend::Canvas;
+use crate::stages::specularity_substitution::blend::{Canvas, PLAIN};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 
@@ -44,7 +44,7 @@ pub fn replace(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, planes: 
         .for_each(|(y, (((image, code), view), confidence))| {
             let beliefs = canvas.belief.row(y);
             for (x, &belief) in beliefs.iter().enumerate() {
-                if belief == 0 {
+                if belief <= PLAIN {
                     continue;
                 }
                 let share = share_of(scene, canvas, settings, x, y);
@@ -75,24 +75,11 @@ fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y
     } else {
         AGAINST_WEIGHT
     };
-    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + against * darker_around(scene, canvas, x, y);
+    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0)
+        + against * canvas.against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
     let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
     let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
     smooth(brighter) * smooth((4.0 * near).min(1.0))
-}
-
-/// By how much the pixels around are darker than what was measured, levels, mean over 3 × 3 cells.
-fn darker_around(scene: &Scene<'_>, canvas: &Canvas, x: usize, y: usize) -> f32 {
-    let grid = scene.grid;
-    let (column, row) = (x / grid.cell, y / grid.cell);
-    let (mut sum, mut count) = (0.0_f32, 0.0_f32);
-    for v in row.saturating_sub(1)..(row + 2).min(grid.down) {
-        for cell in &canvas.against[v * grid.across + column.saturating_sub(1)..v * grid.across + (column + 2).min(grid.across)] {
-            sum += cell[0];
-            count += cell[1];
-        }
-    }
-    sum / count.max(1.0)
 }
 
 fn smooth(t: f32) -> f32 {

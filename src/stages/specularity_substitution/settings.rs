@@ -14,6 +14,8 @@ pub struct Settings {
     pub excess_low_levels: f32,
     /// A pixel this much brighter is replaced wholly, levels.
     pub excess_high_levels: f32,
+    /// At most so many views take part in a frame, 64 at the most: each costs its fit.
+    pub max_views: usize,
     /// Whether a small shift is looked for around each hole.
     pub align_on_ring: bool,
     /// Rounds of that search.
@@ -34,6 +36,7 @@ impl Default for Settings {
             margin_px: 24.0,
             excess_low_levels: 2.0,
             excess_high_levels: 5.0,
+            max_views: 64,
             align_on_ring: true,
             ring_rounds: 2,
             max_shift_px: 4.0,

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use crossbeam::queue::ArrayQueue;
 use rayon::prelude::*;
 
 use crate::camera::model::CameraModel;
@@ -11,38 +12,37 @@ use crate::image::distance::chamfer_distance;
 use crate::image::hole_filling::HoleFiller;
 use crate::image::pool::Pool;
 use crate::image::specularity::REFERENCE_WIDTH_PX;
-use crate::light_field::mapping::Mapping;
 use crate::light_field::rasterize::DepthRasterizer;
 use crate::light_field::view::LightField;
 use crate::pipeline::stage::{Stage, StageError};
-use crate::stages::specularity_substitution::blend::{Canvas, Chosen};
+use crate::stages::specularity_substitution::blend::Canvas;
 use crate::stages::specularity_substitution::camera_blending::CameraBlending;
+use crate::stages::specularity_substitution::drawing::Chosen;
 use crate::stages::specularity_substitution::grid::Grid;
 use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::replacement::{Planes, replace};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
+use crate::stages::specularity_substitution::sight::{Vantage, Views};
+use crate::stages::specularity_substitution::small_view::SmallView;
 use crate::stages::specularity_substitution::support::Support;
-use crate::stages::specularity_substitution::view_fit::{ViewFit, small_copy};
+use crate::stages::specularity_substitution::view_fit::{Comparison, Statistics, ViewFit, Workbench};
 
 /// Depth is carried into holes over about 2 to this power, px of the depth's picture.
-const DEPTH_REACH_LEVELS: usize = 6;
+const DEPTH_REACH_LEVELS: usize = 5;
 /// Widest picture over which depth is drawn pixel for pixel.
-const DEPTH_WIDTH_PX: usize = 960;
+const DEPTH_WIDTH_PX: usize = 480;
 /// Picture pixels along a pixel of the depth's picture.
 fn depth_step(width: usize) -> usize {
     width.div_ceil(DEPTH_WIDTH_PX).max(1)
 }
-
-/// No place among the fits.
-const NO_SLOT: u16 = u16::MAX;
 
 /// Replaces specularities by what other views saw; without a light field it only says what it left.
 #[derive(Debug)]
 pub struct SpecularitySubstitution {
     settings: Settings,
     light_field: Option<Arc<LightField>>,
-    small_views: Vec<Image<[u8; 4]>>,
+    small_views: Vec<SmallView>,
     rasterizer: DepthRasterizer,
     filler: HoleFiller,
     support: Support,
@@ -50,11 +50,12 @@ pub struct SpecularitySubstitution {
     coarse_camera: Option<CameraModel>,
     distance: Image<u16>,
     forbidden: Mask,
-    mappings: Vec<Option<Mapping>>,
+    vantages: Vec<Option<Vantage>>,
     blending: CameraBlending,
     live: Live,
+    /// One a view.
     fits: Vec<ViewFit>,
-    slots: Vec<u16>,
+    benches: ArrayQueue<Workbench>,
     canvas: Canvas,
     out: Image<Rgb8>,
     codes: Pool<u8>,
@@ -66,7 +67,8 @@ impl SpecularitySubstitution {
     pub fn new(settings: &Settings, light_field: Option<Arc<LightField>>) -> Self {
         let small_views = light_field
             .as_ref()
-            .map_or_else(Vec::new, |field| field.views.par_iter().map(small_copy).collect());
+            .map_or_else(Vec::new, |field| field.views.par_iter().map(SmallView::of).collect());
+        let fits = small_views.iter().map(|_| ViewFit::default()).collect();
         Self {
             settings: settings.clone(),
             light_field,
@@ -78,11 +80,11 @@ impl SpecularitySubstitution {
             coarse_camera: None,
             distance: Image::filled(0, 0, 0),
             forbidden: Image::filled(0, 0, 0),
-            mappings: Vec::new(),
+            vantages: Vec::new(),
             blending: CameraBlending::default(),
             live: Live::default(),
-            fits: Vec::new(),
-            slots: Vec::new(),
+            fits,
+            benches: ArrayQueue::new(64),
             canvas: Canvas::default(),
             out: Image::filled(0, 0, [0; 3]),
             codes: Pool::new(64),
@@ -146,23 +148,43 @@ impl SpecularitySubstitution {
             guard: Scene::distance_of(self.settings.guard_px * scale),
             ring,
         };
-        self.mappings.clear();
-        self.mappings
-            .extend(light_field.views.iter().map(|view| Mapping::new(camera, eye, view)));
-        self.blending.choose(&scene, &self.mappings);
+        self.vantages.clear();
+        self.vantages.extend(
+            (light_field.views.iter().zip(&self.small_views)).map(|(view, small)| Vantage::new(camera, eye, view, small)),
+        );
+        let views = Views {
+            full: &light_field.views,
+            vantages: &self.vantages,
+        };
         self.live.look(&scene);
-        let count = assign_slots(&scene, &self.live, &self.blending, &mut self.fits, &mut self.slots);
-        let (live, small_views, mappings, settings) = (&self.live, &self.small_views, &self.mappings, &self.settings);
-        self.fits[..count].par_iter_mut().with_max_len(1).for_each(|fit| {
-            if let Some(mapping) = &mappings[fit.view] {
-                fit.measure(&scene, live, &small_views[fit.view], mapping, settings);
-            }
-        });
+        self.blending
+            .choose(&scene, &self.live.holes, &views, self.settings.max_views);
+        call_for_fits(&scene, &self.live, &self.blending, &mut self.fits);
+        let (benches, vantages) = (&self.benches, &self.vantages);
+        let needed = self.fits.par_iter_mut().zip(&self.small_views).zip(vantages).with_max_len(1);
+        needed
+            .filter(|((fit, _), _)| fit.is_needed())
+            .for_each(|((fit, view), vantage)| {
+                if let Some(Vantage { small: mapping, .. }) = vantage {
+                    let comparison = Comparison {
+                        grid: scene.grid,
+                        scale: scene.scale,
+                        live: &self.live,
+                        view,
+                        mapping,
+                        settings: &self.settings,
+                    };
+                    let mut bench = benches.pop().unwrap_or_default();
+                    fit.measure(&comparison, &mut bench);
+                    // More benches than the queue holds are simply freed.
+                    let _surplus = benches.push(bench);
+                }
+            });
         let chosen = Chosen {
             corners: self.blending.corners(),
-            fits: &self.fits[..count],
-            slots: &self.slots,
-            mappings: &self.mappings,
+            fits: &self.fits,
+            small_views: &self.small_views,
+            vantages: &self.vantages,
         };
         self.canvas.draw(&scene, &self.live, &chosen);
         self.out.copy_from(&frame.image);
@@ -174,52 +196,39 @@ impl SpecularitySubstitution {
             confidence: &mut provenance.confidence,
         };
         replace(&scene, &self.canvas, &self.settings, planes);
-        let statistics = (self.fits[..count].iter())
-            .map(|fit| fit.statistics(&self.live.holes))
-            .fold([0.0_f32; 3], |sum, one| std::array::from_fn(|i| sum[i] + one[i]));
-        let brightness = mean_brightness(&self.live);
-        if let Some(alignment) = &mut frame.alignment
-            && statistics[2] > 0.0
-        {
-            alignment.region_shift_px = (statistics[0] / statistics[2]).sqrt();
-            alignment.residual_levels = (statistics[1] / statistics[2]).sqrt() * brightness;
+        if let Some(alignment) = &mut frame.alignment {
+            let sums = (self.fits.iter().filter(|fit| fit.is_needed()))
+                .map(ViewFit::statistics)
+                .fold(Statistics::default(), |sum, one| Statistics {
+                    shift: sum.shift + one.shift,
+                    difference: sum.difference + one.difference,
+                    count: sum.count + one.count,
+                });
+            if sums.count > 0.0 {
+                alignment.region_shift_px = (sums.shift / sums.count).sqrt();
+                alignment.residual_levels = (sums.difference / sums.count).sqrt() * mean_brightness(&self.live);
+            }
         }
         frame.provenance = Some(provenance);
         frame.image.swap(&mut self.out);
     }
 }
 
-/// One fit for every view that speaks anywhere; how many.
-fn assign_slots(
-    scene: &Scene<'_>,
-    live: &Live,
-    blending: &CameraBlending,
-    fits: &mut Vec<ViewFit>,
-    slots: &mut Vec<u16>,
-) -> usize {
-    slots.clear();
-    slots.resize(scene.light_field.views.len(), NO_SLOT);
-    let mut count = 0;
+/// Tell every view where it speaks.
+fn call_for_fits(scene: &Scene<'_>, live: &Live, blending: &CameraBlending, fits: &mut [ViewFit]) {
+    for fit in &mut *fits {
+        fit.begin(scene.grid);
+    }
     let across = CameraBlending::corners_across(scene.grid);
     for (index, corner) in blending.corners().iter().enumerate() {
         for voice in corner.voices() {
-            let slot = &mut slots[usize::from(voice.view)];
-            if *slot == NO_SLOT {
-                *slot = count as u16;
-                if fits.len() == count {
-                    fits.push(ViewFit::default());
-                }
-                fits[count].begin(voice.view.into(), scene.grid.count());
-                count += 1;
-            }
-            fits[usize::from(*slot)].need_around(scene, live, index % across, index / across);
+            fits[usize::from(voice.view)].need_around(scene, live, index % across, index / across);
         }
     }
-    count
 }
 
 fn mean_brightness(live: &Live) -> f32 {
-    let (weight, sum) = (live.detail.iter()).fold((0.0_f32, 0.0_f32), |(w, s), cell| (w + cell[0], s + cell[1]));
+    let (weight, sum) = (live.detail.iter()).fold((0.0_f32, 0.0_f32), |(w, s), block| (w + block[0], s + block[1]));
     sum / weight.max(1e-6)
 }
 
@@ -251,15 +260,28 @@ impl Stage for SpecularitySubstitution {
                 "no specularity mask: the detection stage must run before the substitution".into(),
             ));
         };
+        if frame.scene_cut {
+            self.reset();
+        }
         let light_field = self.light_field.clone();
         let aligned = frame.alignment.is_some_and(|a| a.aligned) && frame.world_from_camera.is_some();
         match (light_field, frame.camera.clone()) {
             (Some(light_field), Some(camera)) if aligned && specular.size() == frame.image.size() => {
                 self.substitute(frame, &specular, &light_field, &camera);
             }
-            _ => frame.provenance = Some(all_left(&self.codes, &self.views, &specular)),
+            _ => {
+                self.reset();
+                frame.provenance = Some(all_left(&self.codes, &self.views, &specular));
+            }
         }
         frame.specularities = Some(specular);
         Ok(())
+    }
+
+    fn reset(&mut self) {
+        for fit in &mut self.fits {
+            fit.forget();
+        }
+        self.blending.forget();
     }
 }

@@ -8,7 +8,7 @@ use crate::image::buffer::{Image, Mask};
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 
 /// Edge of a cell, px of the depth's picture.
-const CELL_PX: usize = 8;
+const CELL_PX: usize = 4;
 /// A cell is measured where at least this share of its pixels is.
 const MEASURED_SHARE: f32 = 0.1;
 /// Gaps up to twice this are closed, cells.
@@ -87,7 +87,7 @@ mod tests {
         let mut depth = Image::filled(width, height, 0.0);
         for y in 0..height {
             for x in 0..160 {
-                let in_hole = (40..80).contains(&x) && (100..140).contains(&y);
+                let in_hole = (40..100).contains(&x) && (100..160).contains(&y);
                 depth.set(x, y, if in_hole { 0.0 } else { 70.0 });
             }
         }
