@@ -245,6 +245,28 @@ mod tests {
     }
 
     #[test]
+    fn a_pale_organ_is_no_steel() {
+        let mut image = tissue(1.0);
+        for y in 60..200 {
+            for x in 100..260 {
+                let (u, v) = ((x as f32 - 180.0) / 80.0, (y as f32 - 130.0) / 70.0);
+                let shade = 1.0 - 0.45 * (u * u + v * v);
+                if u * u + v * v < 1.0 {
+                    image.set(x, y, [190.0, 172.0, 168.0].map(|c: f32| (c * shade) as u8));
+                }
+            }
+        }
+        let (specular, steel) = detect(&image);
+        assert_eq!(count(&steel), 0);
+        let inside = |x: usize, y: usize| ((x as f32 - 180.0) / 70.0).hypot((y as f32 - 130.0) / 60.0) < 1.0;
+        let marked = (0..HEIGHT)
+            .flat_map(|y| (0..WIDTH).map(move |x| (x, y)))
+            .filter(|&(x, y)| inside(x, y) && specular.at(x, y) != 0)
+            .count();
+        assert!(marked * 50 < 70 * 60 * 3, "{marked} px of a pale organ");
+    }
+
+    #[test]
     fn white_gauze_is_no_specularity_and_steel_is_steel() {
         let mut image = tissue(1.0);
         for y in 40..160 {

@@ -8,7 +8,7 @@
 //! max(R, G, B) does. White gauze or fat as a whole is its own background and does not stand out; a core must stand far above, its halo
 //! may stand less far but must touch a core.
 //!
-//! Steel is grey where tissue is red, over a connected area that is not all bright; its highlights lie inside.
+//! Steel is grey where tissue is red, over a connected area that is dark or of much contrast; its highlights lie inside.
 //!
 //! All lengths below are given for a picture 960 px wide and scale with the width.
 //!

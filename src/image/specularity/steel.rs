@@ -1,4 +1,7 @@
-//! Instruments: connected grey areas that are not all bright, with a margin.
+//! Instruments: connected grey areas that are dark or of much contrast, what is nearly grey and hangs together with them, and a margin.
+//!
+//! A pale organ is grey as well, but evenly lit; polished steel mirrors bright and dark side by side. Its jaws and edges mix with the
+//! colours around: they are followed from the shaft.
 
 use crate::image::blur::{BlurScratch, box_blur};
 use crate::image::buffer::{Image, Mask};
@@ -11,9 +14,15 @@ use crate::image::specularity::settings::{CELLS_ACROSS, Settings};
 const MIN_LEVEL: f32 = 30.0;
 /// Highlights on tissue are grey too, but small: a cell counts where this share of its neighbourhood is grey.
 const MIN_GREY_SHARE: f32 = 0.75;
-/// Steel has shades: this share of a region is darker than the bright level (for a well exposed picture).
-const MIN_SHADED_SHARE: f32 = 0.45;
-const BRIGHT_LEVEL: f32 = 165.0;
+/// Steel shines and mirrors the dark: the standard deviation of a region over its mean is at least this. On a real operation shafts have
+/// 0.26 to 0.41, pale gall bladders up to 0.16.
+const MIN_CONTRAST: f32 = 0.2;
+/// A region whose mean is darker is steel all the same (for a well exposed picture): pale organs are bright, means from 150 levels up.
+const DARK_LEVEL: f32 = 130.0;
+/// Cells of up to this saturation are followed …
+const FOLLOWED_SATURATION: f32 = 0.33;
+/// … so far from a grey region, cells.
+const FOLLOWED_CELLS: usize = 24;
 
 /// Finds steel; owns its working memory.
 #[derive(Debug)]
@@ -21,7 +30,10 @@ pub(super) struct Steel {
     grey: Image<f32>,
     distance: Image<u16>,
     components: Components,
-    shaded: Vec<u32>,
+    /// Per region: sum of the levels and of their squares.
+    sums: Vec<[f32; 2]>,
+    frontier: Vec<usize>,
+    next: Vec<usize>,
     /// 255 on steel, one value a cell.
     pub mask: Mask,
 }
@@ -32,7 +44,9 @@ impl Steel {
             grey: Image::filled(0, 0, 0.0),
             distance: Image::filled(0, 0, 0),
             components: Components::default(),
-            shaded: Vec::new(),
+            sums: Vec::new(),
+            frontier: Vec::new(),
+            next: Vec::new(),
             mask: Image::filled(0, 0, 0),
         }
     }
@@ -56,23 +70,56 @@ impl Steel {
             *steel = if share > MIN_GREY_SHARE { 255 } else { 0 };
         }
         self.components.label(&self.mask);
-        self.shaded.clear();
-        self.shaded.resize(self.components.regions().len(), 0);
-        let bright = BRIGHT_LEVEL * brightness;
+        self.sums.clear();
+        self.sums.resize(self.components.regions().len(), [0.0; 2]);
         for run in self.components.runs() {
-            let row = &cells.least.row(run.y as usize)[run.begin as usize..run.end as usize];
-            self.shaded[run.label as usize] += row.iter().filter(|least| **least < bright).count() as u32;
+            let sums = &mut self.sums[run.label as usize];
+            for level in &cells.least.row(run.y as usize)[run.begin as usize..run.end as usize] {
+                *sums = [sums[0] + level, sums[1] + level * level];
+            }
         }
         let min_area = settings.steel_min_share * (width * height) as f32;
-        let shaded = &self.shaded;
+        let sums = &self.sums;
         self.mask.fill(0);
         self.components.paint(&mut self.mask, 255, |label, region| {
-            region.area as f32 > min_area && shaded[label] as f32 > MIN_SHADED_SHARE * region.area as f32
+            let area = region.area as f32;
+            let mean = sums[label][0] / area;
+            let variance = sums[label][1] / area - mean * mean;
+            area > min_area && (variance > (MIN_CONTRAST * mean).powi(2) || mean < DARK_LEVEL * brightness)
         });
+        self.follow(cells);
         let limit = (radius + 2) as u16 * UNITS_PER_PX;
         chamfer_distance(&self.mask, limit + 1, &mut self.distance);
         for (steel, &distance) in self.mask.pixels_mut().iter_mut().zip(self.distance.pixels()) {
             *steel = if distance <= limit { 255 } else { 0 };
+        }
+    }
+
+    /// Extend the mask to the nearly grey cells that hang together with it.
+    fn follow(&mut self, cells: &Cells) {
+        let (width, height) = self.mask.size();
+        let found = self.mask.pixels().iter().enumerate().filter(|(_, steel)| **steel != 0);
+        self.frontier.clear();
+        self.frontier.extend(found.map(|(index, _)| index));
+        for _ in 0..FOLLOWED_CELLS {
+            self.next.clear();
+            for &index in &self.frontier {
+                let (x, y) = (index % width, index / width);
+                let left = (x > 0).then(|| index - 1);
+                let right = (x + 1 < width).then_some(index + 1);
+                let above = (y > 0).then(|| index - width);
+                let below = (y + 1 < height).then_some(index + width);
+                for near in [left, right, above, below].into_iter().flatten() {
+                    let [r, g, b] = cells.rgb.pixels()[near];
+                    let (most, least) = (r.max(g).max(b), r.min(g).min(b));
+                    let is_nearly_grey = most > MIN_LEVEL && most - least < FOLLOWED_SATURATION * most;
+                    if is_nearly_grey && cells.valid.pixels()[near] != 0 && self.mask.pixels()[near] == 0 {
+                        self.mask.pixels_mut()[near] = 255;
+                        self.next.push(near);
+                    }
+                }
+            }
+            std::mem::swap(&mut self.frontier, &mut self.next);
         }
     }
 }
