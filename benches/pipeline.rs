@@ -1,7 +1,7 @@
 //! How fast the whole line is on this machine: 1080p frames of a simulated operation through every stage.
 //!
-//! `cargo bench --bench pipeline [-- [FRAMES] [--front] [--json FILE] [--recording FOLDER --light-field FOLDER [--enlarge N]]]`, 200 frames unless told, fewer
-//! where they would take longer than a quarter of a minute. Three tables:
+//! `cargo bench --bench pipeline [-- [FRAMES] [--front] [--json FILE] [--recording FOLDER --light-field FOLDER [--enlarge N]]]`, 200
+//! frames unless told, fewer where they would take longer than a quarter of a minute. Three tables:
 //!
 //! 1. each stage alone on one core: processor time a frame, which does not depend on what else the machine does;
 //! 2. the line as it runs, one thread a stage over rayon's pool: wall time a frame and stage, and frames per second;

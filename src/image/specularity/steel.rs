@@ -58,11 +58,12 @@ impl Steel {
             self.mask.resize(width, height, 0);
             self.grey.resize(width, height, 0.0);
         }
-        let colors = cells.rgb.pixels().iter().zip(cells.valid.pixels());
-        for (grey, ([r, g, b], valid)) in self.grey.pixels_mut().iter_mut().zip(colors) {
-            let (most, least) = (r.max(*g).max(*b), r.min(*g).min(*b));
-            let is_grey = *valid != 0 && most > MIN_LEVEL && most - least < settings.steel_saturation * most;
-            *grey = if is_grey { 1.0 } else { 0.0 };
+        for (cell, grey) in self.grey.pixels_mut().iter_mut().enumerate() {
+            *grey = if is_grey(cells, cell, settings.steel_saturation) {
+                1.0
+            } else {
+                0.0
+            };
         }
         let radius = (2.0 * width as f32 / CELLS_ACROSS as f32).round().max(1.0) as usize;
         box_blur(&mut self.grey, radius, scratch);
@@ -110,10 +111,7 @@ impl Steel {
                 let above = (y > 0).then(|| index - width);
                 let below = (y + 1 < height).then_some(index + width);
                 for near in [left, right, above, below].into_iter().flatten() {
-                    let [r, g, b] = cells.rgb.pixels()[near];
-                    let (most, least) = (r.max(g).max(b), r.min(g).min(b));
-                    let is_nearly_grey = most > MIN_LEVEL && most - least < FOLLOWED_SATURATION * most;
-                    if is_nearly_grey && cells.valid.pixels()[near] != 0 && self.mask.pixels()[near] == 0 {
+                    if self.mask.pixels()[near] == 0 && is_grey(cells, near, FOLLOWED_SATURATION) {
                         self.mask.pixels_mut()[near] = 255;
                         self.next.push(near);
                     }
@@ -122,4 +120,11 @@ impl Steel {
             std::mem::swap(&mut self.frontier, &mut self.next);
         }
     }
+}
+
+/// True for a cell with color to speak of, whose saturation is below this.
+fn is_grey(cells: &Cells, cell: usize, saturation: f32) -> bool {
+    let [r, g, b] = cells.rgb.pixels()[cell];
+    let (most, least) = (r.max(g).max(b), r.min(g).min(b));
+    cells.valid.pixels()[cell] != 0 && most > MIN_LEVEL && most - least < saturation * most
 }

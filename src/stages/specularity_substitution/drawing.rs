@@ -7,7 +7,7 @@ use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::camera_blending::{CameraBlending, Corner};
 use crate::stages::specularity_substitution::drawn::{Blended, Drawn};
-use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Sums};
+use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Sums};
 use crate::stages::specularity_substitution::live::DARK_LEVELS;
 use crate::stages::specularity_substitution::lookup::bicubic;
 use crate::stages::specularity_substitution::scene::Scene;
@@ -29,6 +29,7 @@ const ASKED: usize = 4;
 const WITNESSES: u16 = 2;
 /// … at a place where they fit at least so well.
 const WITNESS_FIT: f32 = 0.5;
+
 /// What drawing needs besides the scene.
 #[derive(Clone, Copy, Debug)]
 pub struct Chosen<'a> {
@@ -203,12 +204,10 @@ impl Bench {
         self.speakers
             .sort_unstable_by(|a, b| b.loudness().total_cmp(&a.loudness()).then(a.view.cmp(&b.view)));
         self.speakers.truncate(MAX_VOICES);
-        let (across, down) = scene.grid.blocks();
-        let near = |place: usize, step: usize, count: usize| (place + step).saturating_sub(1).min(count - 1);
+        let around = scene.grid.blocks_around(i, j);
         for speaker in &mut self.speakers {
             let field = &chosen.fits[speaker.view].field;
-            speaker.field =
-                std::array::from_fn(|v| std::array::from_fn(|u| field[near(j, v, down) * across + near(i, u, across)]));
+            speaker.field = around.map(|row| row.map(|block| field[block]));
         }
     }
 
@@ -216,13 +215,14 @@ impl Bench {
         self.spots.clear();
         self.plain.clear();
         let grid = scene.grid;
+        let block = Block::of(grid, i, j);
         let mut doubtful = [[false; SMALL_PER_BLOCK]; SMALL_PER_BLOCK];
         for (row, doubtful) in doubtful.iter_mut().enumerate() {
             for (column, doubtful) in doubtful.iter_mut().enumerate() {
                 let (x, y) = (i * SMALL_PER_BLOCK + column, j * SMALL_PER_BLOCK + row);
                 let (cell_column, cell_row) = (x / SMALL_PER_CELL, y / SMALL_PER_CELL);
                 if cell_column < grid.across && cell_row < grid.down && holes[cell_row * grid.across + cell_column] != 0 {
-                    match self.look_at_small(scene, chosen, Block::of(grid, i, j), (x * grid.step, y * grid.step)) {
+                    match self.look_at_small(scene, chosen, block, (x * grid.step, y * grid.step)) {
                         Look::Nothing => {}
                         Look::Plain(plain) => self.plain.push(plain),
                         Look::Doubtful => *doubtful = true,
@@ -230,7 +230,6 @@ impl Bench {
                 }
             }
         }
-        let block = Block::of(grid, i, j);
         for y in block.top..(block.top + block.side).min(grid.height) {
             let doubtful = &doubtful[(y - block.top) / grid.step];
             for x in block.left..(block.left + block.side).min(grid.width) {
@@ -343,7 +342,7 @@ struct Block {
 
 impl Block {
     fn of(grid: Grid, i: usize, j: usize) -> Self {
-        let side = grid.step * SMALL_PER_CELL * CELLS_PER_BLOCK;
+        let side = grid.block();
         Self {
             left: i * side,
             top: j * side,

@@ -71,16 +71,20 @@ impl Grid {
         y / self.block() * self.blocks().0 + x / self.block()
     }
 
+    /// A block and the eight around it; beyond the border the nearest one stands for what is missing.
+    #[inline]
+    pub fn blocks_around(&self, column: usize, row: usize) -> [[usize; 3]; 3] {
+        let (across, down) = self.blocks();
+        let near = |place: usize, step: usize, count: usize| (place + step).saturating_sub(1).min(count - 1);
+        std::array::from_fn(|v| std::array::from_fn(|u| near(row, v, down) * across + near(column, u, across)))
+    }
+
     /// A field at a picture pixel, linear between the centres of blocks.
     #[inline]
     pub fn between(&self, field: &[Sums], x: f32, y: f32) -> Sums {
         let pitch = 1.0 / self.block() as f32;
         let (across, down) = self.blocks();
-        let axis = |v: f32, count: usize| {
-            let place = ((v + 0.5) * pitch - 0.5).clamp(0.0, count as f32 - 1.0);
-            let first = place as usize;
-            (first, (first + 1).min(count - 1), place - first as f32)
-        };
+        let axis = |v: f32, count: usize| between_centres((v + 0.5) * pitch, count);
         let ((x0, x1, fx), (y0, y1, fy)) = (axis(x, across), axis(y, down));
         let (top, bottom) = (y0 * across, y1 * across);
         let (a, b, c, d) = (&field[top + x0], &field[top + x1], &field[bottom + x0], &field[bottom + x1]);
@@ -188,9 +192,9 @@ impl Smoother {
             rows: &mut self.rows,
         });
         for y in span.rows() {
-            let (y0, y1, fy) = neighbours(y, down);
+            let (y0, y1, fy) = between_centres((y as f32 + 0.5) / COARSER as f32, down);
             for (x, block) in (span.left..span.right).zip(&mut blocks[span.row(y, blocks_across)]) {
-                let (x0, x1, fx) = neighbours(x, across);
+                let (x0, x1, fx) = between_centres((x as f32 + 0.5) / COARSER as f32, across);
                 let weight = FAR_WEIGHT / (COARSER * COARSER) as f32;
                 for (row, wy) in [(y0, 1.0 - fy), (y1, fy)] {
                     add(block, &self.coarse[row * across + x0], weight * wy * (1.0 - fx));
@@ -201,9 +205,11 @@ impl Smoother {
     }
 }
 
-/// The two coarse blocks whose middles lie around a fine one's, and how near it is to the second.
-fn neighbours(fine: usize, count: usize) -> (usize, usize, f32) {
-    let place = ((fine as f32 + 0.5) / COARSER as f32 - 0.5).clamp(0.0, count as f32 - 1.0);
+/// The two of `count` blocks in a row between whose centres a place (in blocks, from the first one's edge) lies, and how near it is to the
+/// second.
+#[inline]
+fn between_centres(place: f32, count: usize) -> (usize, usize, f32) {
+    let place = (place - 0.5).clamp(0.0, count as f32 - 1.0);
     let first = place as usize;
     (first, (first + 1).min(count - 1), place - first as f32)
 }

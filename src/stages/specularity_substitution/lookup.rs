@@ -54,6 +54,9 @@ mod tests {
                 image.set(x, y, [(10 * x) as u8, (12 * y) as u8, 77]);
             }
         }
+        // At a step of the table, to rounding; between steps, to half a step along the plane's slope.
+        let color = bicubic(&image, 4, 5, 0.25, 0.625);
+        assert!((color[0] - 42.5).abs() < 1e-3 && (color[1] - 67.5).abs() < 1e-3 && (color[2] - 77.0).abs() < 1e-3);
         let color = bicubic(&image, 4, 5, 0.3, 0.6);
         assert!((color[0] - 43.0).abs() < 0.03 && (color[1] - 67.2).abs() < 0.03 && (color[2] - 77.0).abs() < 1e-3);
     }

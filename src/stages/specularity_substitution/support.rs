@@ -52,15 +52,12 @@ impl Support {
             }
         }
         let limit = CLOSING_CELLS * UNITS_PER_PX;
-        chamfer_distance(&self.known, limit + 1, &mut self.distance);
-        // Now what is far from everything measured …
-        for (known, &distance) in self.known.pixels_mut().iter_mut().zip(self.distance.pixels()) {
-            *known = if distance > limit { 255 } else { 0 };
-        }
-        chamfer_distance(&self.known, limit + 1, &mut self.distance);
-        // … and what is far from that.
-        for (known, &distance) in self.known.pixels_mut().iter_mut().zip(self.distance.pixels()) {
-            *known = if distance > limit { 255 } else { 0 };
+        // First what is far from everything measured, then what is far from that.
+        for _ in 0..2 {
+            chamfer_distance(&self.known, limit + 1, &mut self.distance);
+            for (known, &distance) in self.known.pixels_mut().iter_mut().zip(self.distance.pixels()) {
+                *known = if distance > limit { 255 } else { 0 };
+            }
         }
     }
 

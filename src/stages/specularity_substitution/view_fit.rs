@@ -206,16 +206,6 @@ impl ViewFit {
         }
     }
 
-    /// The factors of luma of a block and the eight around it, row by row.
-    #[inline]
-    fn gains_around(&self, (across, down): (usize, usize), column: usize, row: usize) -> [[f32; 3]; 3] {
-        let near = |place: usize, step: usize, count: usize| (place + step).saturating_sub(1).min(count - 1);
-        std::array::from_fn(|j| {
-            let begin = near(row, j, down) * across;
-            std::array::from_fn(|i| self.field[begin + near(column, i, across)][part::BRIGHTNESS])
-        })
-    }
-
     /// How well the view fits, from the difference that is left.
     fn judge(&mut self, with: &Comparison<'_>, equations: &[Sums]) {
         for row in self.span.rows() {
@@ -345,17 +335,19 @@ impl wide::Kernel for Compare<'_> {
     #[inline(always)]
     fn run(self) {
         let Self { fit, with, bench } = self;
-        let blocks = with.grid.blocks();
+        let across = with.grid.blocks().0;
         let seen = &bench.seen;
         for (row, column) in fit
             .span
             .rows()
             .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
         {
-            let block = row * blocks.0 + column;
+            let block = row * across + column;
             let mut sums = [0.0_f32; 8];
             if fit.context[block] != 0 && bench.sums[block][0] > 0.0 {
-                let gains = fit.gains_around(blocks, column, row);
+                // The factors of luma of the block and the eight around it.
+                let around = with.grid.blocks_around(column, row);
+                let gains = around.map(|row| row.map(|block| fit.field[block][part::BRIGHTNESS]));
                 let (first, good) = with.live.good_of(block);
                 for (good, &here) in good.iter().zip(&seen[first..]) {
                     let (Some(slope), true) = (good.slope, here > 0.0) else {
