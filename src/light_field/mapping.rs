@@ -42,7 +42,7 @@ impl Mapping {
     }
 
     /// Column, row and depth in the view.
-    #[inline]
+    #[inline(always)]
     pub fn apply(&self, x: f32, y: f32, z: f32) -> (f32, f32, f32) {
         let row = |i: usize| (self.m[i][0] * x + self.m[i][1] * y + self.m[i][2]) * z + self.b[i];
         let depth = row(2);
@@ -55,7 +55,7 @@ impl Mapping {
 const OCCLUSION_TOLERANCE: f32 = 0.03;
 
 /// True if a surface seen at depth `held` is what lies at depth `asked`; an unknown depth hides nothing.
-#[inline]
+#[inline(always)]
 pub fn is_unoccluded(held: f32, asked: f32) -> bool {
     held <= 0.0 || (held - asked).abs() <= OCCLUSION_TOLERANCE * asked
 }

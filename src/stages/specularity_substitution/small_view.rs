@@ -73,14 +73,14 @@ impl SmallView {
     }
 
     /// Depth at a pixel of the view itself, mm, 0 where unknown.
-    #[inline]
+    #[inline(always)]
     pub fn depth_at(&self, x: usize, y: usize) -> f32 {
         let (x, y) = ((x / self.step).min(self.width - 1), (y / self.step).min(self.height - 1));
         self.pixels[y * self.width + x].depth
     }
 
     /// What is shown at column `u` and row `v`, linear between pixels; both at least 0 and before the last.
-    #[inline]
+    #[inline(always)]
     pub fn between(&self, u: f32, v: f32) -> Sample {
         let (x, y) = (u as usize, v as usize);
         let (fx, fy) = (u - x as f32, v - y as f32);

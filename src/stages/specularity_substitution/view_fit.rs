@@ -379,7 +379,7 @@ impl wide::Kernel for Compare<'_> {
 }
 
 /// A value at small pixel (x, y) of the middle of 3 × 3 blocks, linear between their centres.
-#[inline]
+#[inline(always)]
 fn between(blocks: &[[f32; 3]; 3], x: u8, y: u8) -> f32 {
     let axis = |v: u8| {
         let place = 0.5 + (f32::from(v) + 0.5) / SMALL_PER_BLOCK as f32;
