@@ -51,6 +51,24 @@ impl Mapping {
     }
 }
 
+impl Mapping {
+    /// [`Self::apply`] for pixels `step` apart along a row, the first at column `left`, at the depths `z`: columns, rows and depths.
+    #[inline(always)]
+    pub fn apply_to_row<const N: usize>(&self, left: f32, step: f32, y: f32, z: &[f32; N]) -> [[f32; N]; 3] {
+        let [a, b, c] = [0, 1, 2].map(|i| {
+            let (first, slope) = (self.m[i][0] * left + self.m[i][1] * y + self.m[i][2], self.m[i][0] * step);
+            let along: [f32; N] = std::array::from_fn(|x| (first + slope * x as f32) * z[x] + self.b[i]);
+            along
+        });
+        let inverse: [f32; N] = std::array::from_fn(|x| 1.0 / c[x]);
+        [
+            std::array::from_fn(|x| a[x] * inverse[x]),
+            std::array::from_fn(|x| b[x] * inverse[x]),
+            c,
+        ]
+    }
+}
+
 /// Relative difference of depth beyond which a view sees something else.
 const OCCLUSION_TOLERANCE: f32 = 0.03;
 

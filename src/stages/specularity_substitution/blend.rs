@@ -151,7 +151,7 @@ impl Canvas {
                                 *excess = luma(pixel.map(f32::from)) - plain.expected;
                             }
                         }
-                        let cell = &mut against[top / scene.grid.cell * scene.grid.across + plain.left / scene.grid.cell];
+                        let cell = &mut against[scene.grid.cell_at(plain.left, top)];
                         let count = (step * step) as f32;
                         cell[0] += count * (plain.darker - NOISE_LEVELS).max(0.0);
                         cell[1] += count;
@@ -169,7 +169,7 @@ impl Canvas {
                         let unsure = RESIDUAL_WEIGHT * (blended.residual - USUAL_RESIDUAL_LEVELS).max(0.0)
                             + DISAGREEMENT_LEVELS * (USUAL_AGREEMENT - blended.agreement).max(0.0);
                         excess[index] = excess_of(scene, spot, blended.color) - unsure;
-                        let cell = &mut against[y / scene.grid.cell * scene.grid.across + x / scene.grid.cell];
+                        let cell = &mut against[scene.grid.cell_at(x, y)];
                         cell[0] += (brightness - spot.live - NOISE_LEVELS).max(0.0);
                         cell[1] += 1.0;
                     }

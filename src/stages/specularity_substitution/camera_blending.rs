@@ -31,6 +31,9 @@ const WORTH_OF_A_GLIMPSE: f32 = 0.3;
 /// A view that speaks at a neighbouring corner already costs this much less, rad: fewer views are drawn, and they change less often.
 const WORTH_OF_COMPANY: f32 = 0.08;
 
+/// So many places are asked for view by view: near each other, they lie near each other in every view.
+const PLACES_AT_ONCE: usize = 128;
+
 /// Cells around a corner that its views should see.
 const SUPPORT: usize = CELLS_PER_BLOCK;
 
@@ -70,12 +73,18 @@ const PLACES_PER_CELL: usize = 4;
 #[derive(Debug, Default)]
 pub struct CameraBlending {
     /// A pixel for every quarter of a cell.
+    lattice: Vec<Place>,
+    /// Those of them that lie in a hole, row by row of cells.
     places: Vec<Place>,
-    /// One for every block with a hole.
+    /// Where each quarter of a cell stands among them.
+    numbers: Vec<u32>,
+    /// Per place a bit for every member of the ensemble that sees it clean.
+    clean: Vec<u64>,
+    /// The same for every one that sees it at all.
+    seen: Vec<u64>,
+    /// One place for every block with a hole.
     samples: Vec<Place>,
     ensemble: Ensemble,
-    /// Per place, per member of the ensemble.
-    sights: Vec<Sight>,
     corners: Vec<Corner>,
 }
 
@@ -116,9 +125,9 @@ impl CameraBlending {
     /// A pixel for every quarter of a cell with a hole: the specular one nearest to the quarter's middle, else the one nearest to the mask.
     fn find_places(&mut self, scene: &Scene<'_>, holes: &[u8]) {
         let grid = scene.grid;
-        self.places.clear();
-        self.places.resize(grid.count() * PLACES_PER_CELL, Place::default());
-        self.places
+        self.lattice.clear();
+        self.lattice.resize(grid.count() * PLACES_PER_CELL, Place::default());
+        self.lattice
             .par_chunks_mut(grid.across * PLACES_PER_CELL)
             .enumerate()
             .for_each(|(row, places)| {
@@ -132,10 +141,18 @@ impl CameraBlending {
                     *place = place_in(scene, left, top, half);
                 }
             });
+        self.places.clear();
+        self.numbers.clear();
+        for place in &self.lattice {
+            self.numbers.push(self.places.len() as u32);
+            if place.depth > 0.0 {
+                self.places.push(*place);
+            }
+        }
         self.samples.clear();
         let (across, down) = grid.blocks();
         for (i, j) in (0..down).flat_map(|j| (0..across).map(move |i| (i, j))) {
-            let places = places_of_block(grid, i, j).map(|p| self.places[p]).filter(|p| p.depth > 0.0);
+            let places = places_of_block(grid, i, j).map(|p| self.lattice[p]).filter(|p| p.depth > 0.0);
             // The one nearest to the mask stands for all.
             self.samples
                 .extend(places.min_by_key(|p| scene.distance.at(p.x as usize, p.y as usize)));
@@ -145,24 +162,42 @@ impl CameraBlending {
     /// How every member sees every place.
     fn look(&mut self, views: &Views<'_>) {
         let members = self.ensemble.members();
-        self.sights.clear();
-        self.sights.resize(self.places.len() * members.len(), Sight::Unseen);
-        self.sights
-            .par_chunks_mut(members.len().max(1))
-            .zip(&self.places)
-            .with_min_len(256)
-            .for_each(|(sights, place)| {
-                if place.depth > 0.0 {
-                    for (sight, &view) in sights.iter_mut().zip(members) {
-                        *sight = views.sight(view, *place);
-                    }
+        for bits in [&mut self.clean, &mut self.seen] {
+            bits.clear();
+            bits.resize(self.places.len(), 0);
+        }
+        (self.places.par_chunks(PLACES_AT_ONCE))
+            .zip(self.clean.par_chunks_mut(PLACES_AT_ONCE))
+            .zip(self.seen.par_chunks_mut(PLACES_AT_ONCE))
+            .for_each(|((places, clean), seen)| {
+                for (member, &view) in members.iter().enumerate() {
+                    let bit = 1 << member;
+                    views.look(view, places, |place, sight| {
+                        seen[place] |= bit;
+                        if sight == Sight::Clean {
+                            clean[place] |= bit;
+                        }
+                    });
                 }
             });
     }
 
+    /// The places around corner (i, j).
+    fn gather(&self, grid: Grid, i: usize, j: usize) -> Holes {
+        let mut holes = Holes {
+            index: [0; 4 * SUPPORT * SUPPORT * PLACES_PER_CELL],
+            count: 0,
+        };
+        for place in places_around(grid, i, j).filter(|&p| self.lattice[p].depth > 0.0) {
+            holes.index[holes.count] = self.numbers[place] as usize;
+            holes.count += 1;
+        }
+        holes
+    }
+
     fn choose_at(&self, grid: Grid, views: &Views<'_>, i: usize, j: usize) -> Corner {
         let mut corner = Corner::default();
-        let holes = gather(grid, i, j, &self.places);
+        let holes = self.gather(grid, i, j);
         if holes.count == 0 {
             return corner;
         }
@@ -183,13 +218,11 @@ impl CameraBlending {
             *penalty = views.penalty(view, first);
         }
         let (mut clean, mut seen) = ([0_u64; MOST_MEMBERS], [0_u64; MOST_MEMBERS]);
-        for (bit, &place) in places.iter().enumerate() {
-            let sights = &self.sights[place * members.len()..][..members.len()];
-            for ((clean, seen), &sight) in clean.iter_mut().zip(&mut seen).zip(sights) {
-                *clean |= u64::from(sight == Sight::Clean) << bit;
-                *seen |= u64::from(sight != Sight::Unseen) << bit;
-            }
+        for ((clean, seen), &place) in clean.iter_mut().zip(&mut seen).zip(places) {
+            (*clean, *seen) = (self.clean[place], self.seen[place]);
         }
+        transpose(&mut clean);
+        transpose(&mut seen);
         let all = u64::MAX >> (u64::BITS as usize - places.len());
         let could_be_seen = (penalties.iter().zip(&clean))
             .filter(|(penalty, _)| penalty.is_finite())
@@ -253,6 +286,22 @@ impl CameraBlending {
     }
 }
 
+/// Turn a matrix of bits over: bit `c` of row `r` becomes bit `r` of row `c`. Quarters of quarters are exchanged (Warren, Hacker's Delight,
+/// 2nd ed., §7-3).
+fn transpose(rows: &mut [u64; 64]) {
+    let mut mask = 0x0000_0000_ffff_ffff_u64;
+    let mut side = 32;
+    while side > 0 {
+        for row in (0..64).filter(|row| row & side == 0) {
+            let exchanged = (rows[row] >> side ^ rows[row + side]) & mask;
+            rows[row] ^= exchanged << side;
+            rows[row + side] ^= exchanged;
+        }
+        side /= 2;
+        mask ^= mask << side;
+    }
+}
+
 /// The pixel that stands for a square.
 fn place_in(scene: &Scene<'_>, left: usize, top: usize, side: usize) -> Place {
     let (mut best, mut place) = (u32::MAX, Place::default());
@@ -287,18 +336,6 @@ struct Holes {
     count: usize,
 }
 
-fn gather(grid: Grid, i: usize, j: usize, places: &[Place]) -> Holes {
-    let mut holes = Holes {
-        index: [0; 4 * SUPPORT * SUPPORT * PLACES_PER_CELL],
-        count: 0,
-    };
-    for place in places_around(grid, i, j).filter(|&p| places[p].depth > 0.0) {
-        holes.index[holes.count] = place;
-        holes.count += 1;
-    }
-    holes
-}
-
 /// The cells of the blocks that meet at corner (i, j).
 pub fn support(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> {
     let columns = (i * CELLS_PER_BLOCK).saturating_sub(SUPPORT)..(i * CELLS_PER_BLOCK + SUPPORT).min(grid.across);
@@ -328,6 +365,7 @@ mod tests {
         let (scene, vantages) = (example.scene(), example.vantages());
         let views = Views {
             full: &example.light_field.views,
+            small: &example.small_views,
             vantages: &vantages,
         };
         let mut blending = CameraBlending::default();
@@ -337,6 +375,22 @@ mod tests {
         let block = scene.grid.block();
         let corner = (HOLE.1 / block) * CameraBlending::corners_across(scene.grid) + HOLE.0 / block;
         blending.corners()[corner].voices().to_vec()
+    }
+
+    #[test]
+    fn a_matrix_of_bits_is_turned_over() {
+        let mut random = 1_u64;
+        let rows: [u64; 64] = std::array::from_fn(|_| {
+            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            random ^ random >> 29
+        });
+        let mut turned = rows;
+        transpose(&mut turned);
+        for (r, row) in rows.iter().enumerate() {
+            for (c, column) in turned.iter().enumerate() {
+                assert_eq!(row >> c & 1, column >> r & 1, "({r}, {c})");
+            }
+        }
     }
 
     #[test]

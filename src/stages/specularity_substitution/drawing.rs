@@ -9,7 +9,7 @@ use crate::stages::specularity_substitution::camera_blending::{CameraBlending, C
 use crate::stages::specularity_substitution::drawn::{Blended, Drawn};
 use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Sums};
 use crate::stages::specularity_substitution::live::DARK_LEVELS;
-use crate::stages::specularity_substitution::lookup::bicubic;
+use crate::stages::specularity_substitution::lookup::{Strip, cubic_across, cubic_down, split};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::sight::Vantage;
 use crate::stages::specularity_substitution::small_view::SmallView;
@@ -65,7 +65,7 @@ impl Spot {
     /// True once more views would change nothing: enough have spoken, or two say that there is nothing to replace.
     #[inline]
     fn is_settled(&self) -> bool {
-        self.clean >= ENOUGH_VIEWS || self.clean >= 2 && self.live <= self.luma / f32::from(self.clean)
+        self.clean >= ENOUGH_VIEWS || self.clean >= 2 && self.live * f32::from(self.clean) <= self.luma
     }
 }
 
@@ -145,6 +145,8 @@ pub struct Bench {
     pub plain: Vec<Plain>,
     speakers: Vec<Speaker>,
     drawn: Drawn,
+    sights: Vec<Sight>,
+    strips: Vec<Strip>,
     blended: Vec<Option<Blended>>,
 }
 
@@ -315,7 +317,8 @@ impl Bench {
             }
             let sample = view.between(u, v);
             if sample.confidence >= CLEAN && is_unoccluded(sample.depth, depth) {
-                sum += luma(brightened(sample.color, &field));
+                let [r, g, b, _] = sample.color;
+                sum += luma(brightened([r, g, b], &field));
                 clean += 1;
                 if clean == WITNESSES {
                     return Some(sum / f32::from(clean));
@@ -338,6 +341,10 @@ struct Block {
     left: usize,
     top: usize,
     side: usize,
+    /// Of half a pixel before the first.
+    begin: [f32; 2],
+    /// One over the side.
+    share: f32,
 }
 
 impl Block {
@@ -347,15 +354,16 @@ impl Block {
             left: i * side,
             top: j * side,
             side,
+            begin: [i, j].map(|at| (at * side) as f32 - 0.5),
+            share: 1.0 / side as f32,
         }
     }
 
     /// Where a pixel lies within it, 0…1 along each axis.
     #[inline(always)]
     fn share_of(self, x: f32, y: f32) -> (f32, f32) {
-        let share = 1.0 / self.side as f32;
-        let inside = |at: f32, begin: usize| ((at + 0.5 - begin as f32) * share).clamp(0.0, 1.0);
-        (inside(x, self.left), inside(y, self.top))
+        let inside = |at: f32, begin: f32| ((at - begin) * self.share).clamp(0.0, 1.0);
+        (inside(x, self.begin[0]), inside(y, self.begin[1]))
     }
 }
 
@@ -378,55 +386,107 @@ impl wide::Kernel for Draw<'_> {
             index,
             bench,
         } = self;
-        let speaker = &bench.speakers[index];
-        let (width, height) = view.image.size();
-        let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 2.0);
-        let confidences = view.confidence.pixels();
-        let begin = index * bench.drawn.pitch;
-        let (mut row, mut columns) = (u16::MAX, [[0.0; 8]; 3]);
-        for (k, spot) in bench.spots.iter_mut().enumerate() {
-            if spot.is_settled() {
-                continue;
-            }
-            let (x, y) = (f32::from(spot.x), f32::from(spot.y));
-            let (fx, fy) = block.share_of(x, y);
-            if spot.y != row {
-                (row, columns) = (spot.y, speaker.columns_at(fy));
-            }
-            let (first, t) = halves(fx);
-            let field = mixed(&columns[first], &columns[first + 1], t);
-            let loud = speaker.loudness_at(fx, fy) * field[part::FIT];
-            let (u, v, depth) = (speaker.mapping).apply(x + field[part::SHIFT], y + field[part::SHIFT + 1], spot.depth);
-            if !(loud > 0.0 && depth > 0.0 && u >= 1.0 && v >= 1.0 && u < last_x && v < last_y) {
-                continue;
-            }
-            let (x0, y0) = (u as usize, v as usize);
-            let corner = y0 * width + x0;
-            // Where any of the four is dazzled the mixture is.
-            let (upper, lower) = (
-                &confidences[corner..corner + 2],
-                &confidences[corner + width..corner + width + 2],
-            );
-            let least = upper[0].min(upper[1]).min(lower[0]).min(lower[1]);
-            if least == 0 || !is_unoccluded(small.depth_at(x0, y0), depth) {
-                continue;
-            }
-            let color = brightened(bicubic(&view.image, x0, y0, u - x0 as f32, v - y0 as f32), &field);
+        let Bench {
+            speakers,
+            spots,
+            drawn,
+            sights,
+            strips,
+            ..
+        } = bench;
+        sights.clear();
+        find_sights(&speakers[index], spots, view, small, block, sights);
+        if strips.len() < sights.len() {
+            strips.resize(sights.len(), [0.0; 16]);
+        }
+        // First all strips, then all colours: each a short loop over memory that fills vector registers.
+        for (strip, sight) in strips.iter_mut().zip(&*sights) {
+            cubic_down(&view.image, sight.x, sight.y, sight.fy, strip);
+        }
+        for (strip, sight) in strips.iter_mut().zip(&*sights) {
+            let color = cubic_across(strip, sight.fx);
+            strip[..4].copy_from_slice(&color);
+        }
+        let begin = index * drawn.pitch;
+        for (strip, sight) in strips.iter().zip(&*sights) {
+            let color = brightened([strip[0], strip[1], strip[2]], &sight.field);
             let brightness = luma(color);
-            if least >= CLEAN {
+            let spot = &mut spots[sight.spot];
+            if sight.confidence >= CLEAN {
                 spot.clean += 1;
                 spot.luma += brightness;
             }
-            let confidence = f32::from(least) / 255.0;
-            let drawn = &mut bench.drawn;
+            let confidence = f32::from(sight.confidence) / 255.0;
+            let place = begin + sight.spot;
             for (plane, channel) in drawn.color.iter_mut().zip(color) {
-                plane[begin + k] = channel;
+                plane[place] = channel;
             }
-            drawn.luma[begin + k] = brightness;
+            drawn.luma[place] = brightness;
             // Clean sights outshout hazy ones by far more than the confidences alone.
-            drawn.weight[begin + k] = loud * confidence * confidence;
-            drawn.confidence[begin + k] = confidence;
-            drawn.residual[begin + k] = field[part::RESIDUAL];
+            drawn.weight[place] = sight.loud * confidence * confidence;
+            drawn.confidence[place] = confidence;
+            drawn.residual[place] = sight.field[part::RESIDUAL];
+        }
+    }
+}
+
+/// Where a view shows a spot.
+#[derive(Clone, Copy, Debug)]
+struct Sight {
+    /// Index of the spot.
+    spot: usize,
+    /// The pixel of the view, and the way to the next.
+    x: usize,
+    y: usize,
+    fx: f32,
+    fy: f32,
+    field: Sums,
+    loud: f32,
+    confidence: u8,
+}
+
+/// Where a speaker's view shows the spots that are not settled, if it does.
+#[inline(always)]
+fn find_sights(speaker: &Speaker, spots: &[Spot], view: &View, small: &SmallView, block: Block, sights: &mut Vec<Sight>) {
+    let (width, height) = view.image.size();
+    let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 3.0);
+    let confidences = view.confidence.pixels();
+    let (mut row, mut columns) = (u16::MAX, [[0.0; 8]; 3]);
+    for (k, spot) in spots.iter().enumerate() {
+        if spot.is_settled() {
+            continue;
+        }
+        let (x, y) = (f32::from(spot.x), f32::from(spot.y));
+        let (fx, fy) = block.share_of(x, y);
+        if spot.y != row {
+            (row, columns) = (spot.y, speaker.columns_at(fy));
+        }
+        let (first, t) = halves(fx);
+        let field = mixed(&columns[first], &columns[first + 1], t);
+        let loud = speaker.loudness_at(fx, fy) * field[part::FIT];
+        let (u, v, depth) = (speaker.mapping).apply(x + field[part::SHIFT], y + field[part::SHIFT + 1], spot.depth);
+        if !(loud > 0.0 && depth > 0.0 && u >= 1.0 && v >= 1.0 && u < last_x && v < last_y) {
+            continue;
+        }
+        let ((x, fx), (y, fy)) = (split(u), split(v));
+        let corner = y * width + x;
+        // Where any of the four is dazzled the mixture is.
+        let (upper, lower) = (
+            &confidences[corner..corner + 2],
+            &confidences[corner + width..corner + width + 2],
+        );
+        let confidence = upper[0].min(upper[1]).min(lower[0]).min(lower[1]);
+        if confidence > 0 && is_unoccluded(small.depth_at(x, y), depth) {
+            sights.push(Sight {
+                spot: k,
+                x,
+                y,
+                fx,
+                fy,
+                field,
+                loud,
+                confidence,
+            });
         }
     }
 }
@@ -446,6 +506,7 @@ mod tests {
         let (scene, vantages, settings) = (example.scene(), example.vantages(), Settings::default());
         let views = Views {
             full: &example.light_field.views,
+            small: &example.small_views,
             vantages: &vantages,
         };
         let (mut blending, mut live) = (CameraBlending::default(), Live::default());

@@ -44,33 +44,28 @@ impl Ensemble {
 
     /// Choose at most `limit` views for the places that stand for the holes of a frame.
     pub fn gather(&mut self, views: &Views<'_>, places: &[Place], limit: usize) {
-        let Views { full, vantages } = views;
         std::mem::swap(&mut self.members, &mut self.former);
         self.members.clear();
         self.weight.clear();
         self.weight.resize(places.len(), 1.0);
         self.worth.clear();
-        self.worth.resize(places.len() * vantages.len(), 0.0);
+        self.worth.resize(places.len() * views.full.len(), 0.0);
         self.worth
             .par_chunks_mut(places.len().max(1))
-            .zip(*vantages)
-            .zip(*full)
-            .for_each(|((worth, vantage), view)| {
-                let Some(vantage) = vantage else { return };
-                for (worth, &place) in worth.iter_mut().zip(places) {
-                    let appeal = 1.0 - vantage.penalty(view, place) / USELESS_PENALTY;
-                    if appeal > 0.0 {
-                        *worth = appeal
-                            * match vantage.sight(view, place) {
-                                Sight::Unseen => 0.0,
-                                Sight::Hazy => WORTH_OF_HAZE,
-                                Sight::Clean => 1.0,
-                            };
-                    }
+            .zip(0..views.full.len() as u16)
+            .for_each(|(worth, view)| {
+                views.look(view, places, |place, sight| {
+                    worth[place] = match sight {
+                        Sight::Hazy => WORTH_OF_HAZE,
+                        Sight::Clean => 1.0,
+                    };
+                });
+                for (worth, &place) in worth.iter_mut().zip(places).filter(|(worth, _)| **worth > 0.0) {
+                    *worth *= (1.0 - views.penalty(view, place) / USELESS_PENALTY).max(0.0);
                 }
             });
         while self.members.len() < limit.min(MOST_MEMBERS) {
-            let Some(best) = self.best_addition(vantages.len()) else {
+            let Some(best) = self.best_addition(views.full.len()) else {
                 break;
             };
             self.members.push(best);
@@ -144,6 +139,7 @@ mod tests {
         let vantages = example.vantages();
         let views = Views {
             full: &example.light_field.views,
+            small: &example.small_views,
             vantages: &vantages,
         };
         let mut ensemble = Ensemble::default();
@@ -161,6 +157,7 @@ mod tests {
         let vantages = example.vantages();
         let views = Views {
             full: &example.light_field.views,
+            small: &example.small_views,
             vantages: &vantages,
         };
         let mut ensemble = Ensemble::default();

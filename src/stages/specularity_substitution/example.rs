@@ -12,7 +12,7 @@ use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::chamfer_distance;
 use crate::light_field::view::{LightField, View};
-use crate::stages::specularity_substitution::grid::Grid;
+use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::sight::Vantage;
 use crate::stages::specularity_substitution::small_view::SmallView;
@@ -141,7 +141,7 @@ impl Example {
             forbidden: &self.forbidden,
             camera: &self.camera,
             eye: &self.eye,
-            depth_step: 1,
+            depth_step: Division::by(1),
             scale: 0.5,
             grid: Grid::over(SIZE),
             reach: Scene::distance_of(8.0),

@@ -14,6 +14,27 @@ pub const SMALL_PER_BLOCK: usize = SMALL_PER_CELL * CELLS_PER_BLOCK;
 /// Numbers of a block, summed and smoothed together.
 pub type Sums = [f32; 8];
 
+/// Division by a small number as a multiplication: exact for places in a picture up to 65 535 px wide.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Division {
+    inverse: u64,
+}
+
+impl Division {
+    /// By at least 1.
+    pub fn by(divisor: usize) -> Self {
+        Self {
+            inverse: (1_u64 << 32).div_ceil(divisor.max(1) as u64),
+        }
+    }
+
+    /// `place` divided, rounded down.
+    #[inline(always)]
+    pub fn of(self, place: usize) -> usize {
+        ((place as u64 * self.inverse) >> 32) as usize
+    }
+}
+
 /// How a picture is laid out in cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Grid {
@@ -29,6 +50,8 @@ pub struct Grid {
     pub across: usize,
     /// Rows of cells.
     pub down: usize,
+    by_cell: Division,
+    by_block: Division,
 }
 
 impl Grid {
@@ -43,6 +66,8 @@ impl Grid {
             cell,
             across: width.div_ceil(cell),
             down: height.div_ceil(cell),
+            by_cell: Division::by(cell),
+            by_block: Division::by(cell * CELLS_PER_BLOCK),
         }
     }
 
@@ -67,8 +92,15 @@ impl Grid {
     }
 
     /// The block in which a picture pixel lies, row by row.
+    #[inline]
     pub fn block_at(&self, x: usize, y: usize) -> usize {
-        y / self.block() * self.blocks().0 + x / self.block()
+        self.by_block.of(y) * self.blocks().0 + self.by_block.of(x)
+    }
+
+    /// The cell in which a picture pixel lies, row by row.
+    #[inline]
+    pub fn cell_at(&self, x: usize, y: usize) -> usize {
+        self.by_cell.of(y) * self.across + self.by_cell.of(x)
     }
 
     /// A block and the eight around it; beyond the border the nearest one stands for what is missing.
@@ -125,6 +157,16 @@ impl Span {
         }
     }
 
+    /// The rectangle and so many blocks around it, within a lattice `across` × `down`.
+    pub fn grown(self, by: usize, (across, down): (usize, usize)) -> Self {
+        Self {
+            left: self.left.saturating_sub(by),
+            top: self.top.saturating_sub(by),
+            right: (self.right + by).min(across),
+            bottom: (self.bottom + by).min(down),
+        }
+    }
+
     /// True if there is nothing in it.
     pub fn is_empty(self) -> bool {
         self.right <= self.left || self.bottom <= self.top
@@ -168,22 +210,26 @@ impl Smoother {
     pub fn smooth(&mut self, grid: Grid, span: Span, blocks: &mut [Sums]) {
         let (blocks_across, blocks_down) = grid.blocks();
         let (across, down) = (blocks_across.div_ceil(COARSER), blocks_down.div_ceil(COARSER));
-        self.coarse.clear();
+        // Two passes carry a cell over twice the radius; what they leave farther out is not asked for.
+        let coarse = Span {
+            left: span.left / COARSER,
+            top: span.top / COARSER,
+            right: span.right.div_ceil(COARSER),
+            bottom: span.bottom.div_ceil(COARSER),
+        };
+        let reached = coarse.grown(RADIUS, (across, down));
         self.coarse.resize(across * down, [0.0; 8]);
+        for row in reached.rows() {
+            self.coarse[reached.row(row, across)].fill([0.0; 8]);
+        }
         for y in span.rows() {
             for (x, block) in (span.left..span.right).zip(&blocks[span.row(y, blocks_across)]) {
                 add(&mut self.coarse[y / COARSER * across + x / COARSER], block, 1.0);
             }
         }
-        let all = Span {
-            left: 0,
-            top: 0,
-            right: across,
-            bottom: down,
-        };
         self.rows.resize(blocks.len(), [0.0; 8]);
         for _ in 0..2 {
-            box_mean(&mut self.coarse, across, all, &mut self.rows);
+            box_mean(&mut self.coarse, across, reached, &mut self.rows);
         }
         wide::run(NearMean {
             blocks,
@@ -323,6 +369,16 @@ fn add(sum: &mut Sums, cell: &Sums, factor: f32) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn division_is_exact() {
+        for divisor in 1..70 {
+            let division = Division::by(divisor);
+            for place in (0..500).chain(65_000..65_536) {
+                assert_eq!(division.of(place), place / divisor, "{place} / {divisor}");
+            }
+        }
+    }
 
     #[test]
     fn a_field_is_linear_between_the_centres_of_blocks() {

@@ -5,11 +5,12 @@ use rayon::prelude::*;
 use crate::image::color::luma;
 use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Smoother, Span, Sums};
 use crate::stages::specularity_substitution::scene::Scene;
+use crate::stages::specularity_substitution::tile::Tile;
 
 /// Added to levels before they are compared as ratios: in the dark ratios are noise.
 pub const DARK_LEVELS: f32 = 6.0;
 
-/// No good pixel.
+/// No tile.
 const NOWHERE: u32 = u32::MAX;
 
 /// A pixel of the small picture.
@@ -20,34 +21,15 @@ struct SmallPixel {
     depth: f32,
 }
 
-/// A good pixel of the small picture.
-#[derive(Clone, Copy, Debug)]
-pub struct Good {
-    /// Its middle in the picture, px.
-    pub x: f32,
-    /// Its middle in the picture, px.
-    pub y: f32,
-    /// Depth, mm.
-    pub depth: f32,
-    /// Luma with [`DARK_LEVELS`] added.
-    pub brightness: f32,
-    /// Mean colour with [`DARK_LEVELS`] added.
-    pub color: [f32; 3],
-    /// Half the relative slope of brightness, a small px, right and down; if all neighbours are good.
-    pub slope: Option<[f32; 2]>,
-    /// The neighbours' places among the good pixels: left, right, above, below; past the end where they are not good.
-    pub around: [u32; 4],
-    /// Column and row within the block.
-    pub within: [u8; 2],
-}
-
 /// The good pixels around the holes of one frame; keeps its memory.
 #[derive(Debug, Default)]
 pub struct Live {
-    /// The good pixels, block by block.
-    pub good: Vec<Good>,
-    /// Where each block's good pixels begin; one more at the end.
-    pub first: Vec<u32>,
+    /// The blocks that have good pixels.
+    tiles: Vec<Tile>,
+    /// Where each block stands among them.
+    places: Vec<u32>,
+    /// How many good pixels the blocks before each have; one more at the end.
+    before: Vec<u32>,
     /// 1 for every cell with a pixel that may be replaced.
     pub holes: Vec<u8>,
     /// 1 for every block with such a cell.
@@ -55,7 +37,6 @@ pub struct Live {
     /// Per block, smoothed: weight, brightness, squared detail (both relative).
     pub detail: Vec<Sums>,
     small: Vec<SmallPixel>,
-    places: Vec<u32>,
     smoother: Smoother,
 }
 
@@ -89,74 +70,34 @@ impl Live {
     pub fn good_in(&self, grid: Grid, span: Span) -> usize {
         let count = |row: usize| {
             let blocks = span.row(row, grid.blocks().0);
-            (self.first[blocks.end] - self.first[blocks.start]) as usize
+            (self.before[blocks.end] - self.before[blocks.start]) as usize
         };
         span.rows().map(count).sum()
     }
 
-    /// The good pixels of a block, and the place of the first.
+    /// The good pixels of a block, if it has any.
     #[inline]
-    pub fn good_of(&self, block: usize) -> (usize, &[Good]) {
-        let (first, end) = (self.first[block] as usize, self.first[block + 1] as usize);
-        (first, &self.good[first..end])
+    pub fn tile(&self, block: usize) -> Option<&Tile> {
+        self.tiles.get(self.places[block] as usize)
     }
 
-    /// Put the good pixels in the order of blocks.
+    /// Put the good pixels into the tiles of their blocks.
     fn gather(&mut self, grid: Grid) {
-        let (width, height) = grid.small();
         let (across, down) = grid.blocks();
-        self.good.clear();
-        self.first.clear();
+        self.tiles.clear();
         self.places.clear();
-        self.places.resize(width * height, NOWHERE);
+        self.before.clear();
+        self.before.push(0);
+        let mut all = 0;
         for (row, column) in (0..down).flat_map(|row| (0..across).map(move |column| (row, column))) {
-            self.first.push(self.good.len() as u32);
-            let columns = column * SMALL_PER_BLOCK..((column + 1) * SMALL_PER_BLOCK).min(width);
-            for y in row * SMALL_PER_BLOCK..((row + 1) * SMALL_PER_BLOCK).min(height) {
-                for x in columns.clone() {
-                    let pixel = self.small[y * width + x];
-                    if pixel.depth <= 0.0 {
-                        continue;
-                    }
-                    self.places[y * width + x] = self.good.len() as u32;
-                    let middle = |at: usize| (at * grid.step) as f32 + 0.5 * grid.step as f32 - 0.5;
-                    self.good.push(Good {
-                        x: middle(x),
-                        y: middle(y),
-                        depth: pixel.depth,
-                        brightness: luma(pixel.color) + DARK_LEVELS,
-                        color: pixel.color.map(|c| c + DARK_LEVELS),
-                        slope: None,
-                        around: [0; 4],
-                        within: [(x % SMALL_PER_BLOCK) as u8, (y % SMALL_PER_BLOCK) as u8],
-                    });
-                }
+            let mut tile = Tile::EMPTY;
+            let count = fill(&mut tile, &self.small, grid.small(), column, row);
+            self.places.push(if count > 0 { self.tiles.len() as u32 } else { NOWHERE });
+            if count > 0 {
+                self.tiles.push(tile);
             }
-        }
-        self.first.push(self.good.len() as u32);
-        let past = self.good.len() as u32;
-        for y in 0..height {
-            for x in 0..width {
-                let place = self.places[y * width + x];
-                if place == NOWHERE {
-                    continue;
-                }
-                let at = |x: usize, y: usize| {
-                    let inside = x < width && y < height;
-                    inside
-                        .then(|| self.places[y * width + x])
-                        .filter(|&p| p != NOWHERE)
-                        .unwrap_or(past)
-                };
-                let around = [at(x.wrapping_sub(1), y), at(x + 1, y), at(x, y.wrapping_sub(1)), at(x, y + 1)];
-                let slope = around.iter().all(|&place| place != past).then(|| {
-                    let [left, right, above, below] = around.map(|place| self.good[place as usize].brightness);
-                    let share = 0.25 / self.good[place as usize].brightness;
-                    [share * (right - left), share * (below - above)]
-                });
-                let good = &mut self.good[place as usize];
-                (good.around, good.slope) = (around, slope);
-            }
+            all += count;
+            self.before.push(all);
         }
     }
 
@@ -173,9 +114,9 @@ impl Live {
         self.detail.clear();
         for block in 0..across * down {
             let mut sums = [0.0; 8];
-            for good in self.good_of(block).1 {
+            for brightness in self.tile(block).into_iter().flat_map(good_brightness) {
                 sums[0] += 1.0;
-                sums[1] += good.brightness;
+                sums[1] += brightness;
             }
             self.detail.push(sums);
         }
@@ -183,15 +124,54 @@ impl Live {
         for block in 0..across * down {
             let mean = (self.detail[block][1] / self.detail[block][0].max(1e-6)).max(1.0);
             let mut sums = [0.0; 8];
-            for good in self.good_of(block).1 {
+            for brightness in self.tile(block).into_iter().flat_map(good_brightness) {
                 sums[0] += 1.0;
-                sums[1] += good.brightness;
-                sums[2] += (good.brightness / mean - 1.0).powi(2);
+                sums[1] += brightness;
+                sums[2] += (brightness / mean - 1.0).powi(2);
             }
             self.detail[block] = sums;
         }
         self.smoother.smooth(grid, all, &mut self.detail);
     }
+}
+
+fn good_brightness(tile: &Tile) -> impl Iterator<Item = f32> {
+    tile.brightness.iter().flatten().copied().filter(|&brightness| brightness > 0.0)
+}
+
+/// Fill the tile of a block from the small picture, `width` × `height`; how many of its pixels are good.
+fn fill(tile: &mut Tile, small: &[SmallPixel], (width, height): (usize, usize), column: usize, row: usize) -> u32 {
+    let good_at = |x: usize, y: usize| {
+        let pixel = (x < width && y < height).then(|| small[y * width + x]);
+        pixel.filter(|pixel| pixel.depth > 0.0)
+    };
+    let brightness_at = |x: usize, y: usize| good_at(x, y).map(|pixel| luma(pixel.color) + DARK_LEVELS);
+    let mut count = 0;
+    for (v, y) in (row * SMALL_PER_BLOCK..((row + 1) * SMALL_PER_BLOCK).min(height)).enumerate() {
+        for (u, x) in (column * SMALL_PER_BLOCK..((column + 1) * SMALL_PER_BLOCK).min(width)).enumerate() {
+            let Some(pixel) = good_at(x, y) else { continue };
+            count += 1;
+            tile.depth[v][u] = pixel.depth;
+            for (plane, channel) in tile.color.iter_mut().zip(pixel.color) {
+                plane[v][u] = channel + DARK_LEVELS;
+            }
+            let brightness = luma(pixel.color) + DARK_LEVELS;
+            tile.brightness[v][u] = brightness;
+            let around = [
+                brightness_at(x.wrapping_sub(1), y),
+                brightness_at(x + 1, y),
+                brightness_at(x, y.wrapping_sub(1)),
+                brightness_at(x, y + 1),
+            ];
+            if let [Some(left), Some(right), Some(above), Some(below)] = around {
+                let share = 0.25 / brightness;
+                tile.slope[0][v][u] = share * (right - left);
+                tile.slope[1][v][u] = share * (below - above);
+                tile.inner[v][u] = 1.0;
+            }
+        }
+    }
+    count
 }
 
 /// One row of cells.
@@ -243,30 +223,37 @@ mod tests {
         let scene = example.scene();
         let mut live = Live::default();
         live.look(&scene);
-        assert!(live.good.len() > 800);
-        for (place, good) in live.good.iter().enumerate() {
-            let (x, y) = (good.x as usize, good.y as usize);
-            let distance = scene.distance.at(x, y);
-            assert!(!in_hole(x, y) && distance > scene.guard && distance <= scene.ring);
-            assert!((good.brightness - DARK_LEVELS - luma(example.image.at(x, y).map(f32::from))).abs() < 1e-3);
-            let block = scene.grid.block_at(x, y);
-            let (first, of_block) = live.good_of(block);
-            assert!((first..first + of_block.len()).contains(&place));
-            for (neighbour, (dx, dy)) in good
-                .around
-                .into_iter()
-                .zip([(-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0)])
-            {
-                if let Some(neighbour) = live.good.get(neighbour as usize) {
-                    assert_eq!((neighbour.x, neighbour.y), (good.x + dx, good.y + dy));
+        let (across, down) = scene.grid.blocks();
+        let all = Span { left: 0, top: 0, right: across, bottom: down };
+        let good = live.good_in(scene.grid, all);
+        assert!(good > 800);
+        let mut found = 0;
+        // In the example a small pixel is a pixel.
+        let lattice = |x: usize, y: usize| {
+            let tile = live.tile(scene.grid.block_at(x, y))?;
+            let brightness = tile.brightness[y % SMALL_PER_BLOCK][x % SMALL_PER_BLOCK];
+            (brightness > 0.0).then_some(brightness)
+        };
+        for y in 1..scene.grid.height - 1 {
+            for x in 1..scene.grid.width - 1 {
+                let Some(here) = lattice(x, y) else { continue };
+                found += 1;
+                let distance = scene.distance.at(x, y);
+                assert!(!in_hole(x, y) && distance > scene.guard && distance <= scene.ring);
+                let color = example.image.at(x, y).map(f32::from);
+                assert!((here - DARK_LEVELS - luma(color)).abs() < 1e-3);
+                let tile = live.tile(scene.grid.block_at(x, y)).unwrap();
+                let (v, u) = (y % SMALL_PER_BLOCK, x % SMALL_PER_BLOCK);
+                assert_eq!(tile.color.map(|plane| plane[v][u]), color.map(|c| c + DARK_LEVELS));
+                let around = [lattice(x - 1, y), lattice(x + 1, y), lattice(x, y - 1), lattice(x, y + 1)];
+                assert_eq!(tile.inner[v][u] > 0.0, around.iter().all(Option::is_some));
+                if let [Some(left), Some(right), Some(above), Some(below)] = around {
+                    assert!((tile.slope[0][v][u] - 0.25 * (right - left) / here).abs() < 1e-5);
+                    assert!((tile.slope[1][v][u] - 0.25 * (below - above) / here).abs() < 1e-5);
                 }
             }
-            if let Some(slope) = good.slope {
-                let at = |i: usize| live.good[good.around[i] as usize].brightness;
-                assert!((slope[0] - 0.25 * (at(1) - at(0)) / good.brightness).abs() < 1e-5);
-                assert!((slope[1] - 0.25 * (at(3) - at(2)) / good.brightness).abs() < 1e-5);
-            }
         }
+        assert_eq!(found, good);
         assert_eq!(live.hole_blocks[scene.grid.block_at(HOLE.0, HOLE.1)], 1);
         assert_eq!(live.hole_blocks[0], 0);
     }

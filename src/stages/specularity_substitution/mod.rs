@@ -32,4 +32,5 @@ pub mod sight;
 pub mod small_view;
 pub mod stage;
 pub mod support;
+mod tile;
 pub mod view_fit;

@@ -6,7 +6,7 @@ use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::UNITS_PER_PX;
 use crate::light_field::view::LightField;
-use crate::stages::specularity_substitution::grid::Grid;
+use crate::stages::specularity_substitution::grid::{Division, Grid};
 
 /// One live frame over the light field.
 #[derive(Clone, Copy, Debug)]
@@ -26,7 +26,7 @@ pub struct Scene<'a> {
     /// Where it was taken.
     pub eye: &'a Transform<World, Camera>,
     /// Picture pixels along a pixel of `depth`.
-    pub depth_step: usize,
+    pub depth_step: Division,
     /// Width of the picture over the width for which lengths are given.
     pub scale: f32,
     /// The frame's cells.
@@ -48,7 +48,7 @@ impl Scene<'_> {
     /// Depth at a pixel, mm; 0 where unknown.
     #[inline]
     pub fn depth_at(&self, x: usize, y: usize) -> f32 {
-        let (x, y) = (x / self.depth_step, y / self.depth_step);
+        let (x, y) = (self.depth_step.of(x), self.depth_step.of(y));
         self.depth.at(x.min(self.depth.width() - 1), y.min(self.depth.height() - 1))
     }
 

@@ -5,6 +5,7 @@ use nalgebra::{Point3, Vector3};
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
+use crate::image::wide;
 use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::small_view::SmallView;
@@ -32,13 +33,9 @@ pub struct Place {
     pub depth: f32,
 }
 
-/// How a view sees a place.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
-#[repr(u8)]
+/// How a view sees a place that it does see: that lies in its picture, is not hidden, and not under the view's own specularity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sight {
-    /// Not at all: out of the picture, hidden, or under the view's own specularity.
-    #[default]
-    Unseen,
     /// Through the haze around one.
     Hazy,
     /// As it is.
@@ -50,6 +47,8 @@ pub enum Sight {
 pub struct Views<'a> {
     /// The views.
     pub full: &'a [View],
+    /// The same, small.
+    pub small: &'a [SmallView],
     /// Where they stand; `None` where one cannot see the frame.
     pub vantages: &'a [Option<Vantage>],
 }
@@ -62,11 +61,13 @@ impl Views<'_> {
         (self.vantages[view].as_ref()).map_or(f32::INFINITY, |vantage| vantage.penalty(&self.full[view], place))
     }
 
-    /// [`Vantage::sight`] of a view.
+    /// [`Vantage::look`] of a view.
     #[inline]
-    pub fn sight(&self, view: u16, place: Place) -> Sight {
+    pub fn look(&self, view: u16, places: &[Place], tell: impl FnMut(usize, Sight)) {
         let view = usize::from(view);
-        (self.vantages[view].as_ref()).map_or(Sight::Unseen, |vantage| vantage.sight(&self.full[view], place))
+        if let Some(vantage) = &self.vantages[view] {
+            vantage.look(&self.full[view], &self.small[view], places, tell);
+        }
     }
 }
 
@@ -123,22 +124,44 @@ impl Vantage {
         angle + RESOLUTION_PENALTY * resolution + 1e-4 + BORDER_PENALTY * (1.0 - border).max(0.0)
     }
 
-    /// What the view shows of a place.
-    #[inline]
-    pub fn sight(&self, view: &View, place: Place) -> Sight {
-        let (x, y, depth) = self.mapping.apply(place.x, place.y, place.depth);
-        let (width, height) = view.image.size();
-        if !(depth > 0.0 && x >= 1.0 && y >= 1.0 && x < width as f32 - 2.0 && y < height as f32 - 2.0) {
-            return Sight::Unseen;
-        }
-        let (column, row) = ((x + 0.5) as usize, (y + 0.5) as usize);
-        let (confidence, held) = (view.confidence.at(column, row), view.depth.at(column, row));
-        if confidence == 0 || !is_unoccluded(held, depth) {
-            Sight::Unseen
-        } else if confidence < HEARD_FROM {
-            Sight::Hazy
-        } else {
-            Sight::Clean
+    /// What the view, of which `small` is the small copy, shows of each of `places`.
+    pub fn look(&self, view: &View, small: &SmallView, places: &[Place], tell: impl FnMut(usize, Sight)) {
+        wide::run(Look {
+            mapping: &self.mapping,
+            view,
+            small,
+            places,
+            tell,
+        });
+    }
+}
+
+/// One view asked for many places.
+struct Look<'a, T> {
+    mapping: &'a Mapping,
+    view: &'a View,
+    small: &'a SmallView,
+    places: &'a [Place],
+    tell: T,
+}
+
+impl<T: FnMut(usize, Sight)> wide::Kernel for Look<'_, T> {
+    #[inline(always)]
+    fn run(mut self) {
+        let (width, height) = self.view.image.size();
+        let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 2.0);
+        let confidences = self.view.confidence.pixels();
+        for (index, place) in self.places.iter().enumerate() {
+            let (x, y, depth) = self.mapping.apply(place.x, place.y, place.depth);
+            if !(depth > 0.0 && x >= 1.0 && y >= 1.0 && x < last_x && y < last_y) {
+                continue;
+            }
+            let (column, row) = ((x + 0.5) as usize, (y + 0.5) as usize);
+            let confidence = confidences[row * width + column];
+            if confidence > 0 && is_unoccluded(self.small.depth_at(column, row), depth) {
+                let is_hazy = confidence < HEARD_FROM;
+                (self.tell)(index, if is_hazy { Sight::Hazy } else { Sight::Clean });
+            }
         }
     }
 }
@@ -177,9 +200,17 @@ mod tests {
         example.light_field.views[2].confidence.fill(0);
         example.light_field.views[3].depth.fill(0.8 * DEPTH);
         example.look_again();
-        let sights = (example.vantages().iter().zip(&example.light_field.views))
-            .map(|(vantage, view)| vantage.unwrap().sight(view, hole()))
-            .collect::<Vec<_>>();
-        assert_eq!(sights, [Sight::Clean, Sight::Hazy, Sight::Unseen, Sight::Unseen]);
+        let vantages = example.vantages();
+        let views = Views {
+            full: &example.light_field.views,
+            small: &example.small_views,
+            vantages: &vantages,
+        };
+        let sights = [0, 1, 2, 3].map(|view| {
+            let mut seen = None;
+            views.look(view, &[hole()], |_, sight| seen = Some(sight));
+            seen
+        });
+        assert_eq!(sights, [Some(Sight::Clean), Some(Sight::Hazy), None, None]);
     }
 }

@@ -1,7 +1,8 @@
 //! A view small enough that looking at a few pixels of every block does not alias.
 
 use crate::light_field::view::View;
-use crate::stages::specularity_substitution::grid::step_for;
+use crate::stages::specularity_substitution::grid::{Division, step_for};
+use crate::stages::specularity_substitution::lookup::split;
 
 /// A pixel: all that a comparison asks for, in one place.
 #[derive(Clone, Copy, Debug, Default)]
@@ -17,6 +18,7 @@ struct SmallPixel {
 pub struct SmallView {
     /// Pixels of the view along a pixel of this.
     pub step: usize,
+    by_step: Division,
     width: usize,
     height: usize,
     pixels: Vec<SmallPixel>,
@@ -25,8 +27,8 @@ pub struct SmallView {
 /// What a small view shows between its pixels.
 #[derive(Clone, Copy, Debug)]
 pub struct Sample {
-    /// Levels.
-    pub color: [f32; 3],
+    /// Levels, and a number that means nothing.
+    pub color: [f32; 4],
     /// The least of the four pixels around.
     pub confidence: u8,
     /// Of the nearest pixel, mm.
@@ -61,6 +63,7 @@ impl SmallView {
         }
         Self {
             step,
+            by_step: Division::by(step),
             width,
             height,
             pixels,
@@ -75,23 +78,23 @@ impl SmallView {
     /// Depth at a pixel of the view itself, mm, 0 where unknown.
     #[inline(always)]
     pub fn depth_at(&self, x: usize, y: usize) -> f32 {
-        let (x, y) = ((x / self.step).min(self.width - 1), (y / self.step).min(self.height - 1));
+        let (x, y) = (self.by_step.of(x).min(self.width - 1), self.by_step.of(y).min(self.height - 1));
         self.pixels[y * self.width + x].depth
     }
 
     /// What is shown at column `u` and row `v`, linear between pixels; both at least 0 and before the last.
     #[inline(always)]
     pub fn between(&self, u: f32, v: f32) -> Sample {
-        let (x, y) = (u as usize, v as usize);
-        let (fx, fy) = (u - x as f32, v - y as f32);
+        let ((x, fx), (y, fy)) = (split(u), split(v));
         let upper = &self.pixels[y * self.width + x..][..2];
         let lower = &self.pixels[(y + 1) * self.width + x..][..2];
         let (a, b, c, d) = (upper[0].color, upper[1].color, lower[0].color, lower[1].color);
-        let color = std::array::from_fn(|i| {
-            let (a, b, c, d) = (f32::from(a[i]), f32::from(b[i]), f32::from(c[i]), f32::from(d[i]));
-            let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
-            top + (bottom - top) * fy
-        });
+        let mix = |from: [f32; 4], to: [f32; 4], share: f32| std::array::from_fn(|i| from[i] + (to[i] - from[i]) * share);
+        let (top, bottom) = (
+            mix(a.map(f32::from), b.map(f32::from), fx),
+            mix(c.map(f32::from), d.map(f32::from), fx),
+        );
+        let color = mix(top, bottom, fy);
         let row = if fy < 0.5 { upper } else { lower };
         Sample {
             color,
@@ -119,7 +122,7 @@ mod tests {
         let small = SmallView::of(view);
         assert_eq!(small.step, 1);
         let sample = small.between(84.0, 50.0);
-        assert_eq!((sample.color, sample.confidence), ([21.0, 25.0, 77.0], 84));
+        assert_eq!((sample.color[..3].to_vec(), sample.confidence), (vec![21.0, 25.0, 77.0], 84));
         // From column 83, which is one level darker.
         let sample = small.between(83.25, 51.5);
         assert!((sample.color[0] - 20.25).abs() < 1e-4 && (sample.color[1] - 25.5).abs() < 1e-4);

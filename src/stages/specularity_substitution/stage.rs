@@ -18,7 +18,7 @@ use crate::pipeline::stage::{Stage, StageError};
 use crate::stages::specularity_substitution::blend::Canvas;
 use crate::stages::specularity_substitution::camera_blending::CameraBlending;
 use crate::stages::specularity_substitution::drawing::Chosen;
-use crate::stages::specularity_substitution::grid::Grid;
+use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::replacement::{Planes, replace};
 use crate::stages::specularity_substitution::scene::Scene;
@@ -141,7 +141,7 @@ impl SpecularitySubstitution {
             forbidden: &self.forbidden,
             camera,
             eye,
-            depth_step: depth_step(camera.width),
+            depth_step: Division::by(depth_step(camera.width)),
             scale,
             grid: Grid::over(specular.size()),
             reach,
@@ -154,6 +154,7 @@ impl SpecularitySubstitution {
         );
         let views = Views {
             full: &light_field.views,
+            small: &self.small_views,
             vantages: &self.vantages,
         };
         self.live.look(&scene);

@@ -12,6 +12,7 @@ use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 use crate::stages::specularity_substitution::small_view::SmallView;
+use crate::stages::specularity_substitution::tile::{EMPTY, LaneSums, Plane, Row, Tile, lanes};
 
 /// A shift is expected to be about this long, small px.
 const EXPECTED_SHIFT: f32 = 0.35;
@@ -23,6 +24,8 @@ const PRIOR: f32 = 3.0 / 12.5 * (EXPECTED_RESIDUAL / EXPECTED_SHIFT) * (EXPECTED
 const GOOD_CONFIDENCE: u8 = 128;
 /// Live pixels count as at most this much brighter than what was measured, levels: haze that no detector saw must not condemn a fit.
 const BRIGHTER_AT_MOST: f32 = 4.0;
+/// A view is warm when it was looked at in this share of its blocks in the last frame already.
+const WARM_SHARE: f32 = 0.7;
 /// Rounds end when no shift changes by more, small px.
 const STILL: f32 = 0.12;
 /// Blocks around a corner that a view is looked at, about the width of the ring.
@@ -78,8 +81,8 @@ pub struct Statistics {
 /// Working memory of one fit at a time.
 #[derive(Debug, Default)]
 pub struct Workbench {
-    /// Per good pixel: luma of the view with [`DARK_LEVELS`] added, 0 where it does not see it; one more at the end.
-    seen: Vec<f32>,
+    /// Per block: luma of the view with [`DARK_LEVELS`] added at each good pixel, 0 where it does not see it. Only where it is looked at.
+    seen: Vec<Plane>,
     sums: Vec<Sums>,
     equations: Vec<Sums>,
     smoother: Smoother,
@@ -157,18 +160,21 @@ impl ViewFit {
     /// Find the fields. A view that spoke in the last frame goes on from there.
     pub fn measure(&mut self, with: &Comparison<'_>, bench: &mut Workbench) {
         let (across, down) = with.grid.blocks();
-        for (row, blocks) in self.field.chunks_mut(across).enumerate() {
-            for (column, field) in blocks.iter_mut().enumerate() {
+        // Between the centres of blocks those around the span are asked too.
+        let asked = self.span.grown(1, (across, down));
+        for row in asked.rows() {
+            for (column, field) in (asked.left..).zip(&mut self.field[asked.row(row, across)]) {
                 if !self.former.holds(column, row) {
                     *field = UNKNOWN;
                 }
             }
         }
-        for sums in [&mut bench.sums, &mut bench.equations] {
-            sums.clear();
-            sums.resize(across * down, [0.0; 8]);
-        }
-        for round in 0..with.settings.ring_rounds.max(1) {
+        // What is out of the span is not read.
+        bench.sums.resize(across * down, [0.0; 8]);
+        bench.equations.resize(across * down, [0.0; 8]);
+        bench.seen.resize(across * down, EMPTY);
+        let rounds = if self.is_warm(across) { 1 } else { with.settings.ring_rounds.max(1) };
+        for round in 0..rounds {
             wide::run(Draw {
                 fit: self,
                 with,
@@ -180,11 +186,23 @@ impl ViewFit {
             wide::run(Compare { fit: self, with, bench });
             bench.smoother.smooth(with.grid, self.span, &mut bench.equations);
             self.judge(with, &bench.equations);
-            if !with.settings.align_on_ring || self.shift(with, &bench.equations) < STILL && round > 0 {
+            if !with.settings.align_on_ring || self.shift(with, &bench.equations) < STILL {
                 break;
             }
         }
-        self.statistics = self.summed_up(with.live, &bench.equations);
+        self.statistics = self.summed_up(across, with.live, &bench.equations);
+    }
+
+    /// True if most of what is looked at was looked at in the last frame too: one more round is enough then, the next frame goes on.
+    fn is_warm(&self, across: usize) -> bool {
+        let (mut known, mut all) = (0, 0);
+        for row in self.span.rows() {
+            for (column, &context) in (self.span.left..).zip(&self.context[self.span.row(row, across)]) {
+                all += usize::from(context);
+                known += usize::from(context != 0 && self.former.holds(column, row));
+            }
+        }
+        known as f32 >= WARM_SHARE * all as f32
     }
 
     fn match_brightness(&mut self, across: usize, sums: &[Sums]) {
@@ -252,11 +270,11 @@ impl ViewFit {
         self.statistics
     }
 
-    fn summed_up(&self, live: &Live, equations: &[Sums]) -> Statistics {
+    fn summed_up(&self, across: usize, live: &Live, equations: &[Sums]) -> Statistics {
         let mut sums = Statistics::default();
-        let blocks = self.field.iter().zip(equations).zip(&live.hole_blocks).zip(&self.context);
-        for (((field, equations), &hole), &context) in blocks {
-            if hole != 0 && context != 0 && field[part::FIT] > 0.5 {
+        for block in self.span.rows().flat_map(|row| self.span.row(row, across)) {
+            let (field, equations) = (&self.field[block], &equations[block]);
+            if live.hole_blocks[block] != 0 && self.context[block] != 0 && field[part::FIT] > 0.5 {
                 sums.shift += field[part::SHIFT].powi(2) + field[part::SHIFT + 1].powi(2);
                 sums.difference += equations[5] / equations[6].max(1e-6);
                 sums.count += 1.0;
@@ -279,49 +297,72 @@ impl wide::Kernel for Draw<'_> {
     fn run(self) {
         let Self { fit, with, bench, again } = self;
         let across = with.grid.blocks().0;
-        let mapping = with.mapping;
-        let (last_x, last_y) = with.view.last();
-        bench.seen.clear();
-        bench.seen.resize(with.live.good.len() + 1, 0.0);
-        for (row, column) in fit
-            .span
-            .rows()
-            .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
-        {
+        for (row, column) in fit.span.rows().flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column))) {
             let block = row * across + column;
-            let mut sums = [0.0_f32; 8];
-            if fit.context[block] != 0 {
-                let field = fit.field[block];
-                let again = again || fit.former.holds(column, row);
-                let gain = field[part::BRIGHTNESS];
-                let (first, good) = with.live.good_of(block);
-                for (good, seen) in good.iter().zip(&mut bench.seen[first..]) {
-                    let (u, v, depth) = mapping.apply(good.x + field[part::SHIFT], good.y + field[part::SHIFT + 1], good.depth);
-                    if !(depth > 0.0 && u >= 0.0 && v >= 0.0 && u < last_x && v < last_y) {
-                        continue;
-                    }
-                    let sample = with.view.between(u, v);
-                    if sample.confidence < GOOD_CONFIDENCE || !is_unoccluded(sample.depth, depth) {
-                        continue;
-                    }
-                    let color = sample.color.map(|c| c + DARK_LEVELS);
-                    *seen = luma(color);
-                    let weight = if again {
-                        let residual = good.brightness / (gain * *seen) - 1.0;
-                        1.0 / (1.0 + (residual / (2.0 * EXPECTED_RESIDUAL)).powi(2))
-                    } else {
-                        1.0
-                    };
-                    sums[0] += weight;
-                    for c in 0..3 {
-                        sums[1 + c] += weight * good.color[c];
-                        sums[4 + c] += weight * color[c];
-                    }
-                }
+            bench.sums[block] = [0.0; 8];
+            if fit.context[block] == 0 {
+                continue;
             }
-            bench.sums[block] = sums;
+            bench.seen[block] = EMPTY;
+            if let Some(tile) = with.live.tile(block) {
+                let field = &fit.field[block];
+                let again = again || fit.former.holds(column, row);
+                let color = look_up(with, tile, field, (column, row));
+                let gain = again.then_some(field[part::BRIGHTNESS]);
+                bench.sums[block] = sum_up(tile, &color, gain, &mut bench.seen[block]);
+            }
         }
     }
+}
+
+/// The view's colours at the good pixels of a block, with [`DARK_LEVELS`] added; 0 where it does not see them.
+#[inline(always)]
+fn look_up(with: &Comparison<'_>, tile: &Tile, field: &Sums, (column, row): (usize, usize)) -> [Plane; 3] {
+    let mut found = [[0.0_f32; 4]; SMALL_PER_BLOCK * SMALL_PER_BLOCK];
+    let (last_x, last_y) = with.view.last();
+    let step = with.grid.step as f32;
+    let middle = |at: usize| at as f32 * step + 0.5 * step - 0.5;
+    let left = middle(column * SMALL_PER_BLOCK) + field[part::SHIFT];
+    for (y, (depths, found)) in tile.depth.iter().zip(found.chunks_exact_mut(SMALL_PER_BLOCK)).enumerate() {
+        let line = middle(row * SMALL_PER_BLOCK + y) + field[part::SHIFT + 1];
+        let [us, vs, farness] = with.mapping.apply_to_row(left, step, line, depths);
+        for (x, found) in found.iter_mut().enumerate() {
+            let (u, v, depth) = (us[x], vs[x], farness[x]);
+            if !(depths[x] > 0.0 && depth > 0.0 && u >= 0.0 && v >= 0.0 && u < last_x && v < last_y) {
+                continue;
+            }
+            let sample = with.view.between(u, v);
+            if sample.confidence >= GOOD_CONFIDENCE && is_unoccluded(sample.depth, depth) {
+                *found = sample.color.map(|c| c + DARK_LEVELS);
+            }
+        }
+    }
+    std::array::from_fn(|c| std::array::from_fn(|y| lanes(|x| found[y * SMALL_PER_BLOCK + x][c])))
+}
+
+/// Colours of both pictures summed over a block, and what was seen of the view; outliers weigh less against a known `gain`.
+#[inline(always)]
+fn sum_up(tile: &Tile, color: &[Plane; 3], gain: Option<f32>, seen: &mut Plane) -> Sums {
+    let mut sums = LaneSums::<7>::ZERO;
+    for (y, seen) in seen.iter_mut().enumerate() {
+        let [red, green, blue] = [&color[0][y], &color[1][y], &color[2][y]];
+        *seen = lanes(|x| luma([red[x], green[x], blue[x]]));
+        let weight = match gain {
+            Some(gain) => lanes(|x| {
+                let expected = gain * if seen[x] > 0.0 { seen[x] } else { f32::MIN_POSITIVE };
+                let residual = (tile.brightness[y][x] / expected - 1.0) * (0.5 / EXPECTED_RESIDUAL);
+                let weight = 1.0 / (1.0 + residual * residual);
+                if seen[x] > 0.0 { weight } else { 0.0 }
+            }),
+            None => lanes(|x| if seen[x] > 0.0 { 1.0 } else { 0.0 }),
+        };
+        sums.add(0, weight);
+        for c in 0..3 {
+            sums.add(1 + c, lanes(|x| weight[x] * tile.color[c][y][x]));
+            sums.add(4 + c, lanes(|x| weight[x] * color[c][y][x]));
+        }
+    }
+    std::array::from_fn(|i| if i < 7 { sums.total(i) } else { 0.0 })
 }
 
 /// Block by block, the normal equations of a shift and the squared difference.
@@ -336,59 +377,106 @@ impl wide::Kernel for Compare<'_> {
     fn run(self) {
         let Self { fit, with, bench } = self;
         let across = with.grid.blocks().0;
-        let seen = &bench.seen;
-        for (row, column) in fit
-            .span
-            .rows()
-            .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
-        {
+        for (row, column) in fit.span.rows().flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column))) {
             let block = row * across + column;
-            let mut sums = [0.0_f32; 8];
-            if fit.context[block] != 0 && bench.sums[block][0] > 0.0 {
+            bench.equations[block] = [0.0; 8];
+            if fit.context[block] == 0 || bench.sums[block][0] <= 0.0 {
+                continue;
+            }
+            if let Some(tile) = with.live.tile(block) {
                 // The factors of luma of the block and the eight around it.
                 let around = with.grid.blocks_around(column, row);
                 let gains = around.map(|row| row.map(|block| fit.field[block][part::BRIGHTNESS]));
-                let (first, good) = with.live.good_of(block);
-                for (good, &here) in good.iter().zip(&seen[first..]) {
-                    let (Some(slope), true) = (good.slope, here > 0.0) else {
-                        continue;
-                    };
-                    let [left, right, above, below] = good.around.map(|place| seen[place as usize]);
-                    if left.min(right).min(above).min(below) <= 0.0 {
-                        continue;
-                    }
-                    let expected = between(&gains, good.within[0], good.within[1]) * here;
-                    let residual = good.brightness / expected - 1.0;
-                    // The mean of both gradients halves the bias of noise (efficient second order, Malis 2004).
-                    let share = 0.25 / here;
-                    let (gx, gy) = (share * (right - left) + slope[0], share * (below - above) + slope[1]);
-                    let weight = 1.0 / (1.0 + (residual / EXPECTED_RESIDUAL).powi(2));
-                    let counted = residual.min(BRIGHTER_AT_MOST / expected);
-                    sums[0] += weight * gx * gx;
-                    sums[1] += weight * gx * gy;
-                    sums[2] += weight * gy * gy;
-                    sums[3] += weight * gx * residual;
-                    sums[4] += weight * gy * residual;
-                    sums[5] += counted * counted;
-                    sums[6] += 1.0;
-                }
+                bench.equations[block] = compare(tile, &fit.bordered(&bench.seen, across, column, row), &gains);
             }
-            bench.equations[block] = sums;
         }
     }
 }
 
-/// A value at small pixel (x, y) of the middle of 3 × 3 blocks, linear between their centres.
+/// What was seen in a block and along its borders.
+struct Bordered {
+    rows: [[f32; SMALL_PER_BLOCK + 2]; SMALL_PER_BLOCK + 2],
+}
+
+impl ViewFit {
+    #[inline(always)]
+    fn bordered(&self, seen: &[Plane], across: usize, column: usize, row: usize) -> Bordered {
+        let mut rows = [[0.0; SMALL_PER_BLOCK + 2]; SMALL_PER_BLOCK + 2];
+        let block = row * across + column;
+        let last = SMALL_PER_BLOCK - 1;
+        let looked_at = |is_inside: bool, block: usize| (is_inside && self.context[block] != 0).then(|| &seen[block]);
+        for (row, seen) in rows[1..].iter_mut().zip(&seen[block]) {
+            row[1..=SMALL_PER_BLOCK].copy_from_slice(seen);
+        }
+        if let Some(left) = looked_at(column > self.span.left, block.wrapping_sub(1)) {
+            for (row, seen) in rows[1..].iter_mut().zip(left) {
+                row[0] = seen[last];
+            }
+        }
+        if let Some(right) = looked_at(column + 1 < self.span.right, block + 1) {
+            for (row, seen) in rows[1..].iter_mut().zip(right) {
+                row[SMALL_PER_BLOCK + 1] = seen[0];
+            }
+        }
+        if let Some(above) = looked_at(row > self.span.top, block.wrapping_sub(across)) {
+            rows[0][1..=SMALL_PER_BLOCK].copy_from_slice(&above[last]);
+        }
+        if let Some(below) = looked_at(row + 1 < self.span.bottom, block + across) {
+            rows[SMALL_PER_BLOCK + 1][1..=SMALL_PER_BLOCK].copy_from_slice(&below[0]);
+        }
+        Bordered { rows }
+    }
+}
+
+/// The normal equations of a shift over a block, and its squared difference.
 #[inline(always)]
-fn between(blocks: &[[f32; 3]; 3], x: u8, y: u8) -> f32 {
-    let axis = |v: u8| {
-        let place = 0.5 + (f32::from(v) + 0.5) / SMALL_PER_BLOCK as f32;
+fn compare(tile: &Tile, seen: &Bordered, gains: &[[f32; 3]; 3]) -> Sums {
+    let mut sums = LaneSums::<7>::ZERO;
+    for y in 0..SMALL_PER_BLOCK {
+        let [above, row, below] = [&seen.rows[y], &seen.rows[y + 1], &seen.rows[y + 2]];
+        let gain = between(gains, y);
+        let counts = lanes(|x| {
+            let least = row[x].min(row[x + 1]).min(row[x + 2]).min(above[x + 1]).min(below[x + 1]);
+            if least > 0.0 { tile.inner[y][x] } else { 0.0 }
+        });
+        let here = lanes(|x| if counts[x] > 0.0 { row[x + 1] } else { 1.0 });
+        let expected = lanes(|x| gain[x] * here[x]);
+        let residual = lanes(|x| {
+            let residual = tile.brightness[y][x] / expected[x] - 1.0;
+            if counts[x] > 0.0 { residual } else { 0.0 }
+        });
+        // The mean of both gradients halves the bias of noise (efficient second order, Malis 2004).
+        let gx = lanes(|x| 0.25 * (row[x + 2] - row[x]) / here[x] + tile.slope[0][y][x]);
+        let gy = lanes(|x| 0.25 * (below[x + 1] - above[x + 1]) / here[x] + tile.slope[1][y][x]);
+        let weight = lanes(|x| {
+            let share = residual[x] * (1.0 / EXPECTED_RESIDUAL);
+            counts[x] / (1.0 + share * share)
+        });
+        let counted = lanes(|x| residual[x].min(BRIGHTER_AT_MOST / expected[x]));
+        sums.add(0, lanes(|x| weight[x] * gx[x] * gx[x]));
+        sums.add(1, lanes(|x| weight[x] * gx[x] * gy[x]));
+        sums.add(2, lanes(|x| weight[x] * gy[x] * gy[x]));
+        sums.add(3, lanes(|x| weight[x] * gx[x] * residual[x]));
+        sums.add(4, lanes(|x| weight[x] * gy[x] * residual[x]));
+        sums.add(5, lanes(|x| counted[x] * counted[x]));
+        sums.add(6, counts);
+    }
+    std::array::from_fn(|i| if i < 7 { sums.total(i) } else { 0.0 })
+}
+
+/// Values along row `y` of small pixels of the middle one of 3 × 3 blocks, linear between their centres.
+#[inline(always)]
+fn between(blocks: &[[f32; 3]; 3], y: usize) -> Row {
+    let axis = |at: usize| {
+        let place = 0.5 + (at as f32 + 0.5) / SMALL_PER_BLOCK as f32;
         (usize::from(place >= 1.0), place - if place >= 1.0 { 1.0 } else { 0.0 })
     };
-    let ((i, fx), (j, fy)) = (axis(x), axis(y));
-    let across = |row: &[f32; 3]| row[i] + (row[i + 1] - row[i]) * fx;
-    let (top, bottom) = (across(&blocks[j]), across(&blocks[j + 1]));
-    top + (bottom - top) * fy
+    let (j, fy) = axis(y);
+    let line: [f32; 3] = std::array::from_fn(|i| blocks[j][i] + (blocks[j + 1][i] - blocks[j][i]) * fy);
+    lanes(|x| {
+        let (i, fx) = axis(x);
+        line[i] + (line[i + 1] - line[i]) * fx
+    })
 }
 
 #[cfg(test)]
