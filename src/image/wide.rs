@@ -29,3 +29,21 @@ pub fn run<K: Kernel>(kernel: K) {
 fn run_avx2<K: Kernel>(kernel: K) {
     kernel.run();
 }
+
+/// Ask for the memory of an item that will soon be read, and go on without waiting for it; nothing happens where there is none.
+///
+/// Looking up a few pixels in each of many pictures is bound by the time of one access to memory after the other.
+#[inline(always)]
+pub fn fetch<T>(items: &[T], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(item) = items.get(index) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a hint that reads and changes nothing; the address is an item's.
+        #[expect(unsafe_code, reason = "there is no safe way to ask ahead; measured MEASURED")]
+        unsafe {
+            _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(item).cast());
+        }
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (items, index);
+}

@@ -52,20 +52,24 @@ impl Mapping {
 }
 
 impl Mapping {
-    /// [`Self::apply`] for pixels `step` apart along a row, the first at column `left`, at the depths `z`: columns, rows and depths.
+    /// [`Self::apply`] for pixels `step` apart along a row, the first at column `left`, at the depths `z`: columns, rows and depths, each as
+    /// many as there are depths.
     #[inline(always)]
-    pub fn apply_to_row<const N: usize>(&self, left: f32, step: f32, y: f32, z: &[f32; N]) -> [[f32; N]; 3] {
-        let [a, b, c] = [0, 1, 2].map(|i| {
-            let (first, slope) = (self.m[i][0] * left + self.m[i][1] * y + self.m[i][2], self.m[i][0] * step);
-            let along: [f32; N] = std::array::from_fn(|x| (first + slope * x as f32) * z[x] + self.b[i]);
-            along
-        });
-        let inverse: [f32; N] = std::array::from_fn(|x| 1.0 / c[x]);
-        [
-            std::array::from_fn(|x| a[x] * inverse[x]),
-            std::array::from_fn(|x| b[x] * inverse[x]),
-            c,
-        ]
+    pub fn apply_to_row(&self, left: f32, step: f32, y: f32, z: &[f32], [us, vs, depths]: [&mut [f32]; 3]) {
+        let [mut first, mut slope] = [[0.0_f32; 3]; 2];
+        for i in 0..3 {
+            first[i] = self.m[i][0] * left + self.m[i][1] * y + self.m[i][2];
+            slope[i] = self.m[i][0] * step;
+        }
+        let places = z.iter().zip(us).zip(vs).zip(depths);
+        for (x, (((&z, u), v), depth)) in (0_i32..).zip(places) {
+            let x = x as f32;
+            let farness = (first[2] + slope[2] * x) * z + self.b[2];
+            let inverse = 1.0 / farness;
+            *u = ((first[0] + slope[0] * x) * z + self.b[0]) * inverse;
+            *v = ((first[1] + slope[1] * x) * z + self.b[1]) * inverse;
+            *depth = farness;
+        }
     }
 }
 
@@ -75,7 +79,8 @@ const OCCLUSION_TOLERANCE: f32 = 0.03;
 /// True if a surface seen at depth `held` is what lies at depth `asked`; an unknown depth hides nothing.
 #[inline(always)]
 pub fn is_unoccluded(held: f32, asked: f32) -> bool {
-    held <= 0.0 || (held - asked).abs() <= OCCLUSION_TOLERANCE * asked
+    // Both sides are cheaper than a branch.
+    (held <= 0.0) | ((held - asked).abs() <= OCCLUSION_TOLERANCE * asked)
 }
 
 #[cfg(test)]

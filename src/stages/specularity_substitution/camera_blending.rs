@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::stages::specularity_substitution::ensemble::{Ensemble, MOST_MEMBERS};
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid};
 use crate::stages::specularity_substitution::scene::Scene;
-use crate::stages::specularity_substitution::sight::{Place, Sight, Views};
+use crate::stages::specularity_substitution::sight::{PLACES_AT_ONCE, Place, Views};
 
 /// At most so many views speak at a corner.
 pub const MAX_VIEWS: usize = 8;
@@ -30,9 +30,6 @@ const WORTH_OF_A_GLIMPSE: f32 = 0.3;
 
 /// A view that speaks at a neighbouring corner already costs this much less, rad: fewer views are drawn, and they change less often.
 const WORTH_OF_COMPANY: f32 = 0.08;
-
-/// So many places are asked for view by view: near each other, they lie near each other in every view.
-const PLACES_AT_ONCE: usize = 128;
 
 /// Cells around a corner that its views should see.
 const SUPPORT: usize = CELLS_PER_BLOCK;
@@ -162,22 +159,21 @@ impl CameraBlending {
     /// How every member sees every place.
     fn look(&mut self, views: &Views<'_>) {
         let members = self.ensemble.members();
-        for bits in [&mut self.clean, &mut self.seen] {
-            bits.clear();
-            bits.resize(self.places.len(), 0);
-        }
+        self.clean.resize(self.places.len(), 0);
+        self.seen.resize(self.places.len(), 0);
         (self.places.par_chunks(PLACES_AT_ONCE))
             .zip(self.clean.par_chunks_mut(PLACES_AT_ONCE))
             .zip(self.seen.par_chunks_mut(PLACES_AT_ONCE))
             .for_each(|((places, clean), seen)| {
+                // A row for every member with a bit for every place; turned over, the other way round.
+                let mut rows = [[0_u64; MOST_MEMBERS]; 2];
                 for (member, &view) in members.iter().enumerate() {
-                    let bit = 1 << member;
-                    views.look(view, places, |place, sight| {
-                        seen[place] |= bit;
-                        if sight == Sight::Clean {
-                            clean[place] |= bit;
-                        }
-                    });
+                    let sights = views.look(view, places);
+                    (rows[0][member], rows[1][member]) = (sights.clean, sights.seen);
+                }
+                for (rows, out) in rows.iter_mut().zip([clean, seen]) {
+                    transpose(rows);
+                    out.copy_from_slice(&rows[..out.len()]);
                 }
             });
     }
@@ -381,7 +377,9 @@ mod tests {
     fn a_matrix_of_bits_is_turned_over() {
         let mut random = 1_u64;
         let rows: [u64; 64] = std::array::from_fn(|_| {
-            random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            random = random
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
             random ^ random >> 29
         });
         let mut turned = rows;

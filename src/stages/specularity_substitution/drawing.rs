@@ -121,7 +121,12 @@ impl Speaker {
     #[inline(always)]
     fn columns_at(&self, fy: f32) -> [Sums; 3] {
         let (row, t) = halves(fy);
-        std::array::from_fn(|i| mixed(&self.field[row][i], &self.field[row + 1][i], t))
+        let (upper, lower) = (&self.field[row], &self.field[row + 1]);
+        [
+            mixed(&upper[0], &lower[0], t),
+            mixed(&upper[1], &lower[1], t),
+            mixed(&upper[2], &lower[2], t),
+        ]
     }
 }
 
@@ -133,7 +138,11 @@ fn halves(place: f32) -> (usize, f32) {
 
 #[inline(always)]
 fn mixed(a: &Sums, b: &Sums, t: f32) -> Sums {
-    std::array::from_fn(|i| a[i] + t * (b[i] - a[i]))
+    let mut sums = [0.0; 8];
+    for i in 0..8 {
+        sums[i] = a[i] + t * (b[i] - a[i]);
+    }
+    sums
 }
 
 /// Working memory of one block at a time.
@@ -332,7 +341,8 @@ impl Bench {
 /// A view's colour under the live picture's light.
 #[inline(always)]
 fn brightened(color: [f32; 3], field: &Sums) -> [f32; 3] {
-    std::array::from_fn(|c| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS)
+    let brightened = |c: usize| (color[c] + DARK_LEVELS) * field[part::GAIN + c] - DARK_LEVELS;
+    [brightened(0), brightened(1), brightened(2)]
 }
 
 /// Where a block lies in the picture, px.
@@ -440,8 +450,11 @@ struct Sight {
     y: usize,
     fx: f32,
     fy: f32,
+    /// There, mm.
+    depth: f32,
     field: Sums,
     loud: f32,
+    /// The least of the pixels around.
     confidence: u8,
 }
 
@@ -469,26 +482,42 @@ fn find_sights(speaker: &Speaker, spots: &[Spot], view: &View, small: &SmallView
             continue;
         }
         let ((x, fx), (y, fy)) = (split(u), split(v));
-        let corner = y * width + x;
+        fetch(view, small, x, y);
+        sights.push(Sight {
+            spot: k,
+            x,
+            y,
+            fx,
+            fy,
+            depth,
+            field,
+            loud,
+            confidence: 0,
+        });
+    }
+    sights.retain_mut(|sight| {
+        let corner = sight.y * width + sight.x;
         // Where any of the four is dazzled the mixture is.
         let (upper, lower) = (
             &confidences[corner..corner + 2],
             &confidences[corner + width..corner + width + 2],
         );
-        let confidence = upper[0].min(upper[1]).min(lower[0]).min(lower[1]);
-        if confidence > 0 && is_unoccluded(small.depth_at(x, y), depth) {
-            sights.push(Sight {
-                spot: k,
-                x,
-                y,
-                fx,
-                fy,
-                field,
-                loud,
-                confidence,
-            });
-        }
+        sight.confidence = upper[0].min(upper[1]).min(lower[0]).min(lower[1]);
+        sight.confidence > 0 && is_unoccluded(small.depth_at(sight.x, sight.y), sight.depth)
+    });
+}
+
+/// Ask for all that a spot at pixel (x, y) of a view needs.
+#[inline(always)]
+fn fetch(view: &View, small: &SmallView, x: usize, y: usize) {
+    let (width, bytes) = (view.image.width(), view.image.as_bytes());
+    let corner = y * width + x;
+    wide::fetch(view.confidence.pixels(), corner);
+    wide::fetch(view.confidence.pixels(), corner + width);
+    for row in 0..4 {
+        wide::fetch(bytes, 3 * (corner + row * width) - 3 * (width + 1));
     }
+    small.fetch_depth(x, y);
 }
 
 #[cfg(test)]

@@ -6,7 +6,7 @@
 
 use rayon::prelude::*;
 
-use crate::stages::specularity_substitution::sight::{Place, Sight, Views};
+use crate::stages::specularity_substitution::sight::{PLACES_AT_ONCE, Place, Views};
 
 /// At most so many views can take part.
 pub const MOST_MEMBERS: usize = 64;
@@ -54,14 +54,14 @@ impl Ensemble {
             .par_chunks_mut(places.len().max(1))
             .zip(0..views.full.len() as u16)
             .for_each(|(worth, view)| {
-                views.look(view, places, |place, sight| {
-                    worth[place] = match sight {
-                        Sight::Hazy => WORTH_OF_HAZE,
-                        Sight::Clean => 1.0,
-                    };
-                });
-                for (worth, &place) in worth.iter_mut().zip(places).filter(|(worth, _)| **worth > 0.0) {
-                    *worth *= (1.0 - views.penalty(view, place) / USELESS_PENALTY).max(0.0);
+                for (worth, places) in worth.chunks_mut(PLACES_AT_ONCE).zip(places.chunks(PLACES_AT_ONCE)) {
+                    let sights = views.look(view, places);
+                    for (bit, (worth, &place)) in worth.iter_mut().zip(places).enumerate() {
+                        if sights.seen >> bit & 1 != 0 {
+                            let of_haze = if sights.clean >> bit & 1 != 0 { 1.0 } else { WORTH_OF_HAZE };
+                            *worth = of_haze * (1.0 - views.penalty(view, place) / USELESS_PENALTY).max(0.0);
+                        }
+                    }
                 }
             });
         while self.members.len() < limit.min(MOST_MEMBERS) {

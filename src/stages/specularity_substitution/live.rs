@@ -91,12 +91,13 @@ impl Live {
         let mut all = 0;
         for (row, column) in (0..down).flat_map(|row| (0..across).map(move |column| (row, column))) {
             let mut tile = Tile::EMPTY;
-            let count = fill(&mut tile, &self.small, grid.small(), column, row);
-            self.places.push(if count > 0 { self.tiles.len() as u32 } else { NOWHERE });
-            if count > 0 {
+            fill(&mut tile, &self.small, grid.small(), column, row);
+            self.places
+                .push(if tile.count > 0 { self.tiles.len() as u32 } else { NOWHERE });
+            if tile.count > 0 {
                 self.tiles.push(tile);
             }
-            all += count;
+            all += tile.count as u32;
             self.before.push(all);
         }
     }
@@ -136,27 +137,28 @@ impl Live {
 }
 
 fn good_brightness(tile: &Tile) -> impl Iterator<Item = f32> {
-    tile.brightness.iter().flatten().copied().filter(|&brightness| brightness > 0.0)
+    tile.brightness.iter().copied().filter(|&brightness| brightness > 0.0)
 }
 
-/// Fill the tile of a block from the small picture, `width` × `height`; how many of its pixels are good.
-fn fill(tile: &mut Tile, small: &[SmallPixel], (width, height): (usize, usize), column: usize, row: usize) -> u32 {
+/// Fill the tile of a block from the small picture, `width` × `height`.
+fn fill(tile: &mut Tile, small: &[SmallPixel], (width, height): (usize, usize), column: usize, row: usize) {
     let good_at = |x: usize, y: usize| {
         let pixel = (x < width && y < height).then(|| small[y * width + x]);
         pixel.filter(|pixel| pixel.depth > 0.0)
     };
     let brightness_at = |x: usize, y: usize| good_at(x, y).map(|pixel| luma(pixel.color) + DARK_LEVELS);
-    let mut count = 0;
     for (v, y) in (row * SMALL_PER_BLOCK..((row + 1) * SMALL_PER_BLOCK).min(height)).enumerate() {
         for (u, x) in (column * SMALL_PER_BLOCK..((column + 1) * SMALL_PER_BLOCK).min(width)).enumerate() {
             let Some(pixel) = good_at(x, y) else { continue };
-            count += 1;
-            tile.depth[v][u] = pixel.depth;
+            let place = v * SMALL_PER_BLOCK + u;
+            tile.good[tile.count] = place as u8;
+            tile.count += 1;
+            tile.depth[place] = pixel.depth;
             for (plane, channel) in tile.color.iter_mut().zip(pixel.color) {
-                plane[v][u] = channel + DARK_LEVELS;
+                plane[place] = channel + DARK_LEVELS;
             }
             let brightness = luma(pixel.color) + DARK_LEVELS;
-            tile.brightness[v][u] = brightness;
+            tile.brightness[place] = brightness;
             let around = [
                 brightness_at(x.wrapping_sub(1), y),
                 brightness_at(x + 1, y),
@@ -165,13 +167,12 @@ fn fill(tile: &mut Tile, small: &[SmallPixel], (width, height): (usize, usize), 
             ];
             if let [Some(left), Some(right), Some(above), Some(below)] = around {
                 let share = 0.25 / brightness;
-                tile.slope[0][v][u] = share * (right - left);
-                tile.slope[1][v][u] = share * (below - above);
-                tile.inner[v][u] = 1.0;
+                tile.slope[0][place] = share * (right - left);
+                tile.slope[1][place] = share * (below - above);
+                tile.inner[place] = 1.0;
             }
         }
     }
-    count
 }
 
 /// One row of cells.
@@ -224,14 +225,19 @@ mod tests {
         let mut live = Live::default();
         live.look(&scene);
         let (across, down) = scene.grid.blocks();
-        let all = Span { left: 0, top: 0, right: across, bottom: down };
+        let all = Span {
+            left: 0,
+            top: 0,
+            right: across,
+            bottom: down,
+        };
         let good = live.good_in(scene.grid, all);
         assert!(good > 800);
         let mut found = 0;
         // In the example a small pixel is a pixel.
         let lattice = |x: usize, y: usize| {
             let tile = live.tile(scene.grid.block_at(x, y))?;
-            let brightness = tile.brightness[y % SMALL_PER_BLOCK][x % SMALL_PER_BLOCK];
+            let brightness = tile.brightness[y % SMALL_PER_BLOCK * SMALL_PER_BLOCK + x % SMALL_PER_BLOCK];
             (brightness > 0.0).then_some(brightness)
         };
         for y in 1..scene.grid.height - 1 {
@@ -243,13 +249,13 @@ mod tests {
                 let color = example.image.at(x, y).map(f32::from);
                 assert!((here - DARK_LEVELS - luma(color)).abs() < 1e-3);
                 let tile = live.tile(scene.grid.block_at(x, y)).unwrap();
-                let (v, u) = (y % SMALL_PER_BLOCK, x % SMALL_PER_BLOCK);
-                assert_eq!(tile.color.map(|plane| plane[v][u]), color.map(|c| c + DARK_LEVELS));
+                let place = y % SMALL_PER_BLOCK * SMALL_PER_BLOCK + x % SMALL_PER_BLOCK;
+                assert_eq!(tile.color.map(|plane| plane[place]), color.map(|c| c + DARK_LEVELS));
                 let around = [lattice(x - 1, y), lattice(x + 1, y), lattice(x, y - 1), lattice(x, y + 1)];
-                assert_eq!(tile.inner[v][u] > 0.0, around.iter().all(Option::is_some));
+                assert_eq!(tile.inner[place] > 0.0, around.iter().all(Option::is_some));
                 if let [Some(left), Some(right), Some(above), Some(below)] = around {
-                    assert!((tile.slope[0][v][u] - 0.25 * (right - left) / here).abs() < 1e-5);
-                    assert!((tile.slope[1][v][u] - 0.25 * (below - above) / here).abs() < 1e-5);
+                    assert!((tile.slope[0][place] - 0.25 * (right - left) / here).abs() < 1e-5);
+                    assert!((tile.slope[1][place] - 0.25 * (below - above) / here).abs() < 1e-5);
                 }
             }
         }

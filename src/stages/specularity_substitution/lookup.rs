@@ -43,10 +43,15 @@ pub fn cubic_down(image: &Image<Rgb8>, x: usize, y: usize, fy: f32, out: &mut St
     let weights = weights_at(fy);
     let (pitch, begin) = (3 * image.width(), 3 * ((y - 1) * image.width() + x - 1));
     let bytes = &image.as_bytes()[begin..begin + 3 * pitch + 16];
-    let rows: [&[u8]; 4] = std::array::from_fn(|row| &bytes[row * pitch..row * pitch + 16]);
-    for (i, out) in out.iter_mut().enumerate() {
-        let [a, b, c, d] = rows.map(|row| f32::from(row[i]));
-        *out = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d;
+    let (a, b, c, d) = (
+        &bytes[..16],
+        &bytes[pitch..][..16],
+        &bytes[2 * pitch..][..16],
+        &bytes[3 * pitch..][..16],
+    );
+    for i in 0..16 {
+        let (a, b, c, d) = (f32::from(a[i]), f32::from(b[i]), f32::from(c[i]), f32::from(d[i]));
+        out[i] = weights[0] * a + weights[1] * b + weights[2] * c + weights[3] * d;
     }
 }
 
@@ -54,7 +59,11 @@ pub fn cubic_down(image: &Image<Rgb8>, x: usize, y: usize, fy: f32, out: &mut St
 #[inline(always)]
 pub fn cubic_across(strip: &Strip, fx: f32) -> [f32; 4] {
     let weights = weights_at(fx);
-    std::array::from_fn(|c| weights[0] * strip[c] + weights[1] * strip[3 + c] + weights[2] * strip[6 + c] + weights[3] * strip[9 + c])
+    let mut color = [0.0; 4];
+    for (c, value) in color.iter_mut().enumerate() {
+        *value = weights[0] * strip[c] + weights[1] * strip[3 + c] + weights[2] * strip[6 + c] + weights[3] * strip[9 + c];
+    }
+    color
 }
 
 #[inline(always)]

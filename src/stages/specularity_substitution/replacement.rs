@@ -75,8 +75,7 @@ fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y
     } else {
         AGAINST_WEIGHT
     };
-    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0)
-        + against * canvas.against[scene.grid.cell_at(x, y)];
+    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + against * canvas.against[scene.grid.cell_at(x, y)];
     let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
     let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
     smooth(brighter) * smooth((4.0 * near).min(1.0))

@@ -10,7 +10,7 @@ use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::small_view::SmallView;
 
-/// A view's pixel counts as a sighting from this confidence on; below it speaks only where nobody else does.
+/// A small pixel of a view counts as a clean sighting from this confidence on; below it speaks only where nobody else does.
 const HEARD_FROM: u8 = 120;
 
 /// Nearer to a view's border than this share of its width a place is not seen …
@@ -33,13 +33,16 @@ pub struct Place {
     pub depth: f32,
 }
 
-/// How a view sees a place that it does see: that lies in its picture, is not hidden, and not under the view's own specularity.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Sight {
-    /// Through the haze around one.
-    Hazy,
-    /// As it is.
-    Clean,
+/// So many places are looked at together.
+pub const PLACES_AT_ONCE: usize = u64::BITS as usize;
+
+/// How a view sees some places, a bit for each.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sights {
+    /// What it sees at all: what lies in its picture, is not hidden, and not under the view's own specularity.
+    pub seen: u64,
+    /// What of that does not lie in the haze around one.
+    pub clean: u64,
 }
 
 /// All views of a light field against one live picture.
@@ -63,11 +66,10 @@ impl Views<'_> {
 
     /// [`Vantage::look`] of a view.
     #[inline]
-    pub fn look(&self, view: u16, places: &[Place], tell: impl FnMut(usize, Sight)) {
+    pub fn look(&self, view: u16, places: &[Place]) -> Sights {
         let view = usize::from(view);
-        if let Some(vantage) = &self.vantages[view] {
-            vantage.look(&self.full[view], &self.small[view], places, tell);
-        }
+        let vantage = self.vantages[view].as_ref();
+        vantage.map_or_else(Sights::default, |vantage| vantage.look(&self.small[view], places))
     }
 }
 
@@ -124,44 +126,47 @@ impl Vantage {
         angle + RESOLUTION_PENALTY * resolution + 1e-4 + BORDER_PENALTY * (1.0 - border).max(0.0)
     }
 
-    /// What the view, of which `small` is the small copy, shows of each of `places`.
-    pub fn look(&self, view: &View, small: &SmallView, places: &[Place], tell: impl FnMut(usize, Sight)) {
+    /// How the view, `small`, sees each of at most 64 places.
+    pub fn look(&self, small: &SmallView, places: &[Place]) -> Sights {
+        let mut sights = Sights::default();
         wide::run(Look {
-            mapping: &self.mapping,
-            view,
+            mapping: &self.small,
             small,
             places,
-            tell,
+            sights: &mut sights,
         });
+        sights
     }
 }
 
 /// One view asked for many places.
-struct Look<'a, T> {
+struct Look<'a> {
     mapping: &'a Mapping,
-    view: &'a View,
     small: &'a SmallView,
     places: &'a [Place],
-    tell: T,
+    sights: &'a mut Sights,
 }
 
-impl<T: FnMut(usize, Sight)> wide::Kernel for Look<'_, T> {
+impl wide::Kernel for Look<'_> {
     #[inline(always)]
-    fn run(mut self) {
-        let (width, height) = self.view.image.size();
-        let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 2.0);
-        let confidences = self.view.confidence.pixels();
-        for (index, place) in self.places.iter().enumerate() {
+    fn run(self) {
+        let (last_x, last_y) = self.small.last();
+        let mut mapped = [(0.0_f32, 0.0_f32, 0.0_f32); PLACES_AT_ONCE];
+        for (mapped, place) in mapped.iter_mut().zip(self.places) {
             let (x, y, depth) = self.mapping.apply(place.x, place.y, place.depth);
-            if !(depth > 0.0 && x >= 1.0 && y >= 1.0 && x < last_x && y < last_y) {
+            if depth > 0.0 && x >= 0.0 && y >= 0.0 && x < last_x && y < last_y {
+                *mapped = (x + 0.5, y + 0.5, depth);
+                self.small.fetch(x + 0.5, y + 0.5);
+            }
+        }
+        for (index, (x, y, depth)) in mapped.into_iter().enumerate() {
+            if depth <= 0.0 {
                 continue;
             }
-            let (column, row) = ((x + 0.5) as usize, (y + 0.5) as usize);
-            let confidence = confidences[row * width + column];
-            if confidence > 0 && is_unoccluded(self.small.depth_at(column, row), depth) {
-                let is_hazy = confidence < HEARD_FROM;
-                (self.tell)(index, if is_hazy { Sight::Hazy } else { Sight::Clean });
-            }
+            let (confidence, held) = self.small.at(x as i32 as usize, y as i32 as usize);
+            let is_seen = (confidence > 0) & is_unoccluded(held, depth);
+            self.sights.seen |= u64::from(is_seen) << index;
+            self.sights.clean |= u64::from(is_seen & (confidence >= HEARD_FROM)) << index;
         }
     }
 }
@@ -206,11 +211,10 @@ mod tests {
             small: &example.small_views,
             vantages: &vantages,
         };
-        let sights = [0, 1, 2, 3].map(|view| {
-            let mut seen = None;
-            views.look(view, &[hole()], |_, sight| seen = Some(sight));
-            seen
-        });
-        assert_eq!(sights, [Some(Sight::Clean), Some(Sight::Hazy), None, None]);
+        // The place in the middle of the hole, twice.
+        let sights = [0, 1, 2, 3]
+            .map(|view| views.look(view, &[hole(); 2]))
+            .map(|sights| (sights.seen, sights.clean));
+        assert_eq!(sights, [(3, 3), (3, 0), (0, 0), (0, 0)]);
     }
 }

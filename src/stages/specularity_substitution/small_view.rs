@@ -1,5 +1,6 @@
 //! A view small enough that looking at a few pixels of every block does not alias.
 
+use crate::image::wide;
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::grid::{Division, step_for};
 use crate::stages::specularity_substitution::lookup::split;
@@ -13,7 +14,15 @@ struct SmallPixel {
     depth: f32,
 }
 
+/// Pixels along a tile.
+const TILE: usize = 8;
+/// Pixels from a row of a tile to the next: tiles overlap by a pixel, so that what lies between pixels of one needs no other.
+const PITCH: usize = TILE + 1;
+
 /// A view at about the resolution of the small live picture.
+///
+/// It is held in tiles: a block of the live picture asks many views for a small square each, and a square of a picture held row by row
+/// lies on as many pages of memory as it has rows, more than the processor keeps track of.
 #[derive(Clone, Debug)]
 pub struct SmallView {
     /// Pixels of the view along a pixel of this.
@@ -21,6 +30,8 @@ pub struct SmallView {
     by_step: Division,
     width: usize,
     height: usize,
+    /// Tiles in a row.
+    across: usize,
     pixels: Vec<SmallPixel>,
 }
 
@@ -40,33 +51,18 @@ impl SmallView {
     pub fn of(view: &View) -> Self {
         let step = step_for(view.image.width());
         let (width, height) = ((view.image.width() / step).max(1), (view.image.height() / step).max(1));
-        let mut pixels = Vec::with_capacity(width * height);
-        for y in 0..height {
-            for x in 0..width {
-                let (mut sum, mut confidence, mut count) = ([0_u32; 3], 255, 0);
-                for v in y * step..((y + 1) * step).min(view.image.height()) {
-                    for u in x * step..((x + 1) * step).min(view.image.width()) {
-                        for (sum, channel) in sum.iter_mut().zip(view.image.at(u, v)) {
-                            *sum += u32::from(channel);
-                        }
-                        confidence = view.confidence.at(u, v).min(confidence);
-                        count += 1;
-                    }
-                }
-                let [r, g, b] = sum.map(|s| ((s + count / 2) / count.max(1)) as u8);
-                let middle = |at: usize, end: usize| (at * step + step / 2).min(end - 1);
-                pixels.push(SmallPixel {
-                    color: [r, g, b, confidence],
-                    depth: view.depth.at(middle(x, view.depth.width()), middle(y, view.depth.height())),
-                });
-            }
-        }
+        let across = width.div_ceil(TILE);
+        let places = (0..height.div_ceil(TILE)).flat_map(|row| (0..across).map(move |column| (column * TILE, row * TILE)));
+        let places = places.flat_map(|(left, top)| (0..PITCH * PITCH).map(move |i| (left + i % PITCH, top + i / PITCH)));
         Self {
             step,
             by_step: Division::by(step),
             width,
             height,
-            pixels,
+            across,
+            pixels: places
+                .map(|(x, y)| small_pixel(view, step, x.min(width - 1), y.min(height - 1)))
+                .collect(),
         }
     }
 
@@ -78,29 +74,85 @@ impl SmallView {
     /// Depth at a pixel of the view itself, mm, 0 where unknown.
     #[inline(always)]
     pub fn depth_at(&self, x: usize, y: usize) -> f32 {
-        let (x, y) = (self.by_step.of(x).min(self.width - 1), self.by_step.of(y).min(self.height - 1));
-        self.pixels[y * self.width + x].depth
+        self.pixels[self.index_of(x, y)].depth
+    }
+
+    /// Ask for what [`Self::depth_at`] will read.
+    #[inline(always)]
+    pub fn fetch_depth(&self, x: usize, y: usize) {
+        wide::fetch(&self.pixels, self.index_of(x, y));
+    }
+
+    /// Where the pixel stands in which a pixel of the view lies.
+    #[inline(always)]
+    fn index_of(&self, x: usize, y: usize) -> usize {
+        self.index(
+            self.by_step.of(x).min(self.width - 1),
+            self.by_step.of(y).min(self.height - 1),
+        )
+    }
+
+    /// Where a pixel stands in the tile that it and those right of it and below it share.
+    #[inline(always)]
+    fn index(&self, x: usize, y: usize) -> usize {
+        (y / TILE * self.across + x / TILE) * (PITCH * PITCH) + y % TILE * PITCH + x % TILE
+    }
+
+    /// Ask for what [`Self::between`] and [`Self::at`] will read there.
+    #[inline(always)]
+    pub fn fetch(&self, u: f32, v: f32) {
+        let index = self.index(u as i32 as usize, v as i32 as usize);
+        wide::fetch(&self.pixels, index);
+        wide::fetch(&self.pixels, index + PITCH + 1);
+    }
+
+    /// The least confidence of a pixel of this, and its depth, mm, 0 where unknown.
+    #[inline(always)]
+    pub fn at(&self, x: usize, y: usize) -> (u8, f32) {
+        let pixel = &self.pixels[self.index(x, y)];
+        (pixel.color[3], pixel.depth)
     }
 
     /// What is shown at column `u` and row `v`, linear between pixels; both at least 0 and before the last.
     #[inline(always)]
     pub fn between(&self, u: f32, v: f32) -> Sample {
         let ((x, fx), (y, fy)) = (split(u), split(v));
-        let upper = &self.pixels[y * self.width + x..][..2];
-        let lower = &self.pixels[(y + 1) * self.width + x..][..2];
+        let index = self.index(x, y);
+        let square = &self.pixels[index..index + PITCH + 2];
+        let (upper, lower) = (&square[..2], &square[PITCH..]);
         let (a, b, c, d) = (upper[0].color, upper[1].color, lower[0].color, lower[1].color);
-        let mix = |from: [f32; 4], to: [f32; 4], share: f32| std::array::from_fn(|i| from[i] + (to[i] - from[i]) * share);
-        let (top, bottom) = (
-            mix(a.map(f32::from), b.map(f32::from), fx),
-            mix(c.map(f32::from), d.map(f32::from), fx),
-        );
-        let color = mix(top, bottom, fy);
+        let mut color = [0.0; 4];
+        for (i, value) in color.iter_mut().enumerate() {
+            let (a, b, c, d) = (f32::from(a[i]), f32::from(b[i]), f32::from(c[i]), f32::from(d[i]));
+            let (top, bottom) = (a + (b - a) * fx, c + (d - c) * fx);
+            *value = top + (bottom - top) * fy;
+        }
         let row = if fy < 0.5 { upper } else { lower };
         Sample {
             color,
             confidence: a[3].min(b[3]).min(c[3]).min(d[3]),
             depth: row[usize::from(fx >= 0.5)].depth,
         }
+    }
+}
+
+/// The mean of a square of a view's pixels.
+fn small_pixel(view: &View, step: usize, x: usize, y: usize) -> SmallPixel {
+    let (mut sum, mut confidence, mut count) = ([0_u32; 3], 255, 0);
+    for v in y * step..((y + 1) * step).min(view.image.height()) {
+        for u in x * step..((x + 1) * step).min(view.image.width()) {
+            for (sum, channel) in sum.iter_mut().zip(view.image.at(u, v)) {
+                *sum += u32::from(channel);
+            }
+            confidence = view.confidence.at(u, v).min(confidence);
+            count += 1;
+        }
+    }
+    let [r, g, b] = sum.map(|s| ((s + count / 2) / count.max(1)) as u8);
+    let middle = |at: usize, end: usize| (at * step + step / 2).min(end - 1);
+    SmallPixel {
+        color: [r, g, b, confidence],
+        depth: view.depth.at(middle(x, view.depth.width()), middle(y, view.depth.height())),
     }
 }
 

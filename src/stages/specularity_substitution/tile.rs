@@ -1,18 +1,25 @@
-//! One block of the small live picture: 8 × 8 pixels in planes, so that a row fills a vector register.
+//! One block of the small live picture: 8 × 8 pixels in planes, row by row.
+//!
+//! What is computed for a whole plane is written as plain loops over arrays, without closures that build arrays: the compiler then fills
+//! vector registers with it.
 
 use crate::stages::specularity_substitution::grid::SMALL_PER_BLOCK;
 
-/// A row of a block's pixels.
-pub type Row = [f32; SMALL_PER_BLOCK];
+/// Pixels of a block.
+pub const LANES: usize = SMALL_PER_BLOCK * SMALL_PER_BLOCK;
 /// A number for each pixel of a block, row by row.
-pub type Plane = [Row; SMALL_PER_BLOCK];
+pub type Plane = [f32; LANES];
 
 /// A plane of zeros.
-pub const EMPTY: Plane = [[0.0; SMALL_PER_BLOCK]; SMALL_PER_BLOCK];
+pub const EMPTY: Plane = [0.0; LANES];
 
-/// The good pixels of a block; every plane is 0 where a pixel is not good.
+/// The good pixels of a block; planes are 0 where a pixel is not good.
 #[derive(Clone, Copy, Debug)]
 pub struct Tile {
+    /// How many pixels are good.
+    pub count: usize,
+    /// Which ones.
+    pub good: [u8; LANES],
     /// mm.
     pub depth: Plane,
     /// Mean colours with [`super::live::DARK_LEVELS`] added.
@@ -28,6 +35,8 @@ pub struct Tile {
 impl Tile {
     /// Without a good pixel.
     pub const EMPTY: Self = Self {
+        count: 0,
+        good: [0; LANES],
         depth: EMPTY,
         color: [EMPTY; 3],
         brightness: EMPTY,
@@ -36,31 +45,14 @@ impl Tile {
     };
 }
 
-/// Sums that are gathered lane by lane and added up at the end.
-#[derive(Clone, Copy, Debug)]
-pub struct LaneSums<const N: usize>([Row; N]);
-
-impl<const N: usize> LaneSums<N> {
-    /// All zero.
-    pub const ZERO: Self = Self([[0.0; SMALL_PER_BLOCK]; N]);
-
-    /// Add a row to sum `i`.
-    #[inline(always)]
-    pub fn add(&mut self, i: usize, row: Row) {
-        for (sum, value) in self.0[i].iter_mut().zip(row) {
-            *sum += value;
+/// The sum of a plane.
+#[inline(always)]
+pub fn total(plane: &Plane) -> f32 {
+    let mut lanes = [0.0_f32; 8];
+    for values in plane.chunks_exact(8) {
+        for (lane, value) in lanes.iter_mut().zip(values) {
+            *lane += value;
         }
     }
-
-    /// Sum `i` over its lanes.
-    #[inline(always)]
-    pub fn total(&self, i: usize) -> f32 {
-        self.0[i].iter().sum()
-    }
-}
-
-/// A value for every lane.
-#[inline(always)]
-pub fn lanes(value: impl Fn(usize) -> f32) -> Row {
-    std::array::from_fn(value)
+    lanes.iter().sum()
 }

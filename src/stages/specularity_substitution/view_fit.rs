@@ -12,7 +12,7 @@ use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 use crate::stages::specularity_substitution::small_view::SmallView;
-use crate::stages::specularity_substitution::tile::{EMPTY, LaneSums, Plane, Row, Tile, lanes};
+use crate::stages::specularity_substitution::tile::{EMPTY, LANES, Plane, Tile, total};
 
 /// A shift is expected to be about this long, small px.
 const EXPECTED_SHIFT: f32 = 0.35;
@@ -173,7 +173,11 @@ impl ViewFit {
         bench.sums.resize(across * down, [0.0; 8]);
         bench.equations.resize(across * down, [0.0; 8]);
         bench.seen.resize(across * down, EMPTY);
-        let rounds = if self.is_warm(across) { 1 } else { with.settings.ring_rounds.max(1) };
+        let rounds = if self.is_warm(across) {
+            1
+        } else {
+            with.settings.ring_rounds.max(1)
+        };
         for round in 0..rounds {
             wide::run(Draw {
                 fit: self,
@@ -297,7 +301,11 @@ impl wide::Kernel for Draw<'_> {
     fn run(self) {
         let Self { fit, with, bench, again } = self;
         let across = with.grid.blocks().0;
-        for (row, column) in fit.span.rows().flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column))) {
+        for (row, column) in fit
+            .span
+            .rows()
+            .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
+        {
             let block = row * across + column;
             bench.sums[block] = [0.0; 8];
             if fit.context[block] == 0 {
@@ -318,51 +326,72 @@ impl wide::Kernel for Draw<'_> {
 /// The view's colours at the good pixels of a block, with [`DARK_LEVELS`] added; 0 where it does not see them.
 #[inline(always)]
 fn look_up(with: &Comparison<'_>, tile: &Tile, field: &Sums, (column, row): (usize, usize)) -> [Plane; 3] {
-    let mut found = [[0.0_f32; 4]; SMALL_PER_BLOCK * SMALL_PER_BLOCK];
     let (last_x, last_y) = with.view.last();
     let step = with.grid.step as f32;
-    let middle = |at: usize| at as f32 * step + 0.5 * step - 0.5;
+    let middle = |at: usize| at as i32 as f32 * step + 0.5 * step - 0.5;
     let left = middle(column * SMALL_PER_BLOCK) + field[part::SHIFT];
-    for (y, (depths, found)) in tile.depth.iter().zip(found.chunks_exact_mut(SMALL_PER_BLOCK)).enumerate() {
+    let (mut us, mut vs, mut farness) = (EMPTY, EMPTY, EMPTY);
+    let rows = tile
+        .depth
+        .chunks_exact(SMALL_PER_BLOCK)
+        .zip(us.chunks_exact_mut(SMALL_PER_BLOCK));
+    let rows = rows
+        .zip(vs.chunks_exact_mut(SMALL_PER_BLOCK))
+        .zip(farness.chunks_exact_mut(SMALL_PER_BLOCK));
+    for (y, (((depths, us), vs), farness)) in rows.enumerate() {
         let line = middle(row * SMALL_PER_BLOCK + y) + field[part::SHIFT + 1];
-        let [us, vs, farness] = with.mapping.apply_to_row(left, step, line, depths);
-        for (x, found) in found.iter_mut().enumerate() {
-            let (u, v, depth) = (us[x], vs[x], farness[x]);
-            if !(depths[x] > 0.0 && depth > 0.0 && u >= 0.0 && v >= 0.0 && u < last_x && v < last_y) {
-                continue;
-            }
-            let sample = with.view.between(u, v);
-            if sample.confidence >= GOOD_CONFIDENCE && is_unoccluded(sample.depth, depth) {
-                *found = sample.color.map(|c| c + DARK_LEVELS);
-            }
+        with.mapping.apply_to_row(left, step, line, depths, [us, vs, farness]);
+    }
+    for &place in &tile.good[..tile.count] {
+        let place = usize::from(place);
+        let (u, v) = (us[place], vs[place]);
+        let is_inside = (farness[place] > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < last_x) & (v < last_y);
+        if is_inside {
+            with.view.fetch(u, v);
+        } else {
+            (us[place], vs[place], farness[place]) = (0.0, 0.0, 0.0);
         }
     }
-    std::array::from_fn(|c| std::array::from_fn(|y| lanes(|x| found[y * SMALL_PER_BLOCK + x][c])))
+    let mut color = [EMPTY; 3];
+    let [red, green, blue] = &mut color;
+    for &place in &tile.good[..tile.count] {
+        let place = usize::from(place);
+        let depth = farness[place];
+        let sample = with.view.between(us[place], vs[place]);
+        let is_good = (depth > 0.0) & (sample.confidence >= GOOD_CONFIDENCE) & is_unoccluded(sample.depth, depth);
+        let [r, g, b, _] = sample.color;
+        red[place] = if is_good { r + DARK_LEVELS } else { 0.0 };
+        green[place] = if is_good { g + DARK_LEVELS } else { 0.0 };
+        blue[place] = if is_good { b + DARK_LEVELS } else { 0.0 };
+    }
+    color
 }
 
 /// Colours of both pictures summed over a block, and what was seen of the view; outliers weigh less against a known `gain`.
 #[inline(always)]
 fn sum_up(tile: &Tile, color: &[Plane; 3], gain: Option<f32>, seen: &mut Plane) -> Sums {
-    let mut sums = LaneSums::<7>::ZERO;
-    for (y, seen) in seen.iter_mut().enumerate() {
-        let [red, green, blue] = [&color[0][y], &color[1][y], &color[2][y]];
-        *seen = lanes(|x| luma([red[x], green[x], blue[x]]));
-        let weight = match gain {
-            Some(gain) => lanes(|x| {
-                let expected = gain * if seen[x] > 0.0 { seen[x] } else { f32::MIN_POSITIVE };
-                let residual = (tile.brightness[y][x] / expected - 1.0) * (0.5 / EXPECTED_RESIDUAL);
-                let weight = 1.0 / (1.0 + residual * residual);
-                if seen[x] > 0.0 { weight } else { 0.0 }
-            }),
-            None => lanes(|x| if seen[x] > 0.0 { 1.0 } else { 0.0 }),
-        };
-        sums.add(0, weight);
-        for c in 0..3 {
-            sums.add(1 + c, lanes(|x| weight[x] * tile.color[c][y][x]));
-            sums.add(4 + c, lanes(|x| weight[x] * color[c][y][x]));
-        }
+    let [red, green, blue] = color;
+    let mut weight = EMPTY;
+    let gain = gain.unwrap_or(0.0);
+    for i in 0..LANES {
+        let luma = luma([red[i], green[i], blue[i]]);
+        seen[i] = luma;
+        let expected = (gain * luma).max(f32::MIN_POSITIVE);
+        let residual = (tile.brightness[i] / expected - 1.0) * (0.5 / EXPECTED_RESIDUAL);
+        let trust = if gain > 0.0 { 1.0 / (1.0 + residual * residual) } else { 1.0 };
+        weight[i] = if luma > 0.0 { trust } else { 0.0 };
     }
-    std::array::from_fn(|i| if i < 7 { sums.total(i) } else { 0.0 })
+    let mut sums = [0.0; 8];
+    sums[0] = total(&weight);
+    for (c, (live, view)) in tile.color.iter().zip(color).enumerate() {
+        let (mut live_part, mut view_part) = (EMPTY, EMPTY);
+        for i in 0..LANES {
+            live_part[i] = weight[i] * live[i];
+            view_part[i] = weight[i] * view[i];
+        }
+        (sums[1 + c], sums[4 + c]) = (total(&live_part), total(&view_part));
+    }
+    sums
 }
 
 /// Block by block, the normal equations of a shift and the squared difference.
@@ -377,7 +406,11 @@ impl wide::Kernel for Compare<'_> {
     fn run(self) {
         let Self { fit, with, bench } = self;
         let across = with.grid.blocks().0;
-        for (row, column) in fit.span.rows().flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column))) {
+        for (row, column) in fit
+            .span
+            .rows()
+            .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
+        {
             let block = row * across + column;
             bench.equations[block] = [0.0; 8];
             if fit.context[block] == 0 || bench.sums[block][0] <= 0.0 {
@@ -387,96 +420,130 @@ impl wide::Kernel for Compare<'_> {
                 // The factors of luma of the block and the eight around it.
                 let around = with.grid.blocks_around(column, row);
                 let gains = around.map(|row| row.map(|block| fit.field[block][part::BRIGHTNESS]));
-                bench.equations[block] = compare(tile, &fit.bordered(&bench.seen, across, column, row), &gains);
+                let around = fit.around(&bench.seen, across, column, row);
+                bench.equations[block] = compare(tile, &bench.seen[block], &around, &between(&gains));
             }
         }
     }
 }
 
-/// What was seen in a block and along its borders.
-struct Bordered {
-    rows: [[f32; SMALL_PER_BLOCK + 2]; SMALL_PER_BLOCK + 2],
+/// What was seen left of each pixel of a block, right of it, above and below.
+struct Around {
+    left: Plane,
+    right: Plane,
+    above: Plane,
+    below: Plane,
 }
 
 impl ViewFit {
     #[inline(always)]
-    fn bordered(&self, seen: &[Plane], across: usize, column: usize, row: usize) -> Bordered {
-        let mut rows = [[0.0; SMALL_PER_BLOCK + 2]; SMALL_PER_BLOCK + 2];
+    fn around(&self, seen: &[Plane], across: usize, column: usize, row: usize) -> Around {
+        const SIDE: usize = SMALL_PER_BLOCK;
         let block = row * across + column;
-        let last = SMALL_PER_BLOCK - 1;
-        let looked_at = |is_inside: bool, block: usize| (is_inside && self.context[block] != 0).then(|| &seen[block]);
-        for (row, seen) in rows[1..].iter_mut().zip(&seen[block]) {
-            row[1..=SMALL_PER_BLOCK].copy_from_slice(seen);
-        }
-        if let Some(left) = looked_at(column > self.span.left, block.wrapping_sub(1)) {
-            for (row, seen) in rows[1..].iter_mut().zip(left) {
-                row[0] = seen[last];
+        let (span, here) = (self.span, &seen[block]);
+        // Beyond what was looked at nothing was seen.
+        let at = |is_inside: bool, block: usize| {
+            if is_inside && self.context[block] != 0 {
+                &seen[block]
+            } else {
+                &EMPTY
             }
+        };
+        let above = at(row > span.top, block.wrapping_sub(across));
+        let below = at(row + 1 < span.bottom, block + across);
+        let left = at(column > span.left, block.wrapping_sub(1));
+        let right = at(column + 1 < span.right, block + 1);
+        let mut around = Around {
+            left: EMPTY,
+            right: EMPTY,
+            above: EMPTY,
+            below: EMPTY,
+        };
+        around.above[SIDE..].copy_from_slice(&here[..LANES - SIDE]);
+        around.above[..SIDE].copy_from_slice(&above[LANES - SIDE..]);
+        around.below[..LANES - SIDE].copy_from_slice(&here[SIDE..]);
+        around.below[LANES - SIDE..].copy_from_slice(&below[..SIDE]);
+        around.left[1..].copy_from_slice(&here[..LANES - 1]);
+        around.right[..LANES - 1].copy_from_slice(&here[1..]);
+        for begin in (0..LANES).step_by(SIDE) {
+            around.left[begin] = left[begin + SIDE - 1];
+            around.right[begin + SIDE - 1] = right[begin];
         }
-        if let Some(right) = looked_at(column + 1 < self.span.right, block + 1) {
-            for (row, seen) in rows[1..].iter_mut().zip(right) {
-                row[SMALL_PER_BLOCK + 1] = seen[0];
-            }
-        }
-        if let Some(above) = looked_at(row > self.span.top, block.wrapping_sub(across)) {
-            rows[0][1..=SMALL_PER_BLOCK].copy_from_slice(&above[last]);
-        }
-        if let Some(below) = looked_at(row + 1 < self.span.bottom, block + across) {
-            rows[SMALL_PER_BLOCK + 1][1..=SMALL_PER_BLOCK].copy_from_slice(&below[0]);
-        }
-        Bordered { rows }
+        around
     }
 }
 
 /// The normal equations of a shift over a block, and its squared difference.
 #[inline(always)]
-fn compare(tile: &Tile, seen: &Bordered, gains: &[[f32; 3]; 3]) -> Sums {
-    let mut sums = LaneSums::<7>::ZERO;
-    for y in 0..SMALL_PER_BLOCK {
-        let [above, row, below] = [&seen.rows[y], &seen.rows[y + 1], &seen.rows[y + 2]];
-        let gain = between(gains, y);
-        let counts = lanes(|x| {
-            let least = row[x].min(row[x + 1]).min(row[x + 2]).min(above[x + 1]).min(below[x + 1]);
-            if least > 0.0 { tile.inner[y][x] } else { 0.0 }
-        });
-        let here = lanes(|x| if counts[x] > 0.0 { row[x + 1] } else { 1.0 });
-        let expected = lanes(|x| gain[x] * here[x]);
-        let residual = lanes(|x| {
-            let residual = tile.brightness[y][x] / expected[x] - 1.0;
-            if counts[x] > 0.0 { residual } else { 0.0 }
-        });
+fn compare(tile: &Tile, seen: &Plane, around: &Around, gain: &Plane) -> Sums {
+    let Around {
+        left,
+        right,
+        above,
+        below,
+    } = around;
+    let mut parts = [EMPTY; 7];
+    let [xx, xy, yy, xr, yr, rr, count] = &mut parts;
+    for i in 0..LANES {
+        let least = seen[i].min(left[i]).min(right[i]).min(above[i]).min(below[i]);
+        let counts = if least > 0.0 { tile.inner[i] } else { 0.0 };
+        let here = seen[i].max(f32::MIN_POSITIVE);
+        let expected = gain[i] * here;
+        let residual = if counts > 0.0 {
+            tile.brightness[i] / expected - 1.0
+        } else {
+            0.0
+        };
         // The mean of both gradients halves the bias of noise (efficient second order, Malis 2004).
-        let gx = lanes(|x| 0.25 * (row[x + 2] - row[x]) / here[x] + tile.slope[0][y][x]);
-        let gy = lanes(|x| 0.25 * (below[x + 1] - above[x + 1]) / here[x] + tile.slope[1][y][x]);
-        let weight = lanes(|x| {
-            let share = residual[x] * (1.0 / EXPECTED_RESIDUAL);
-            counts[x] / (1.0 + share * share)
-        });
-        let counted = lanes(|x| residual[x].min(BRIGHTER_AT_MOST / expected[x]));
-        sums.add(0, lanes(|x| weight[x] * gx[x] * gx[x]));
-        sums.add(1, lanes(|x| weight[x] * gx[x] * gy[x]));
-        sums.add(2, lanes(|x| weight[x] * gy[x] * gy[x]));
-        sums.add(3, lanes(|x| weight[x] * gx[x] * residual[x]));
-        sums.add(4, lanes(|x| weight[x] * gy[x] * residual[x]));
-        sums.add(5, lanes(|x| counted[x] * counted[x]));
-        sums.add(6, counts);
+        let share = if counts > 0.0 { 0.25 / here } else { 0.0 };
+        let gx = share * (right[i] - left[i]) + tile.slope[0][i];
+        let gy = share * (below[i] - above[i]) + tile.slope[1][i];
+        let off = residual * (1.0 / EXPECTED_RESIDUAL);
+        let weight = counts / (1.0 + off * off);
+        let counted = residual.min(BRIGHTER_AT_MOST / expected);
+        xx[i] = weight * gx * gx;
+        xy[i] = weight * gx * gy;
+        yy[i] = weight * gy * gy;
+        xr[i] = weight * gx * residual;
+        yr[i] = weight * gy * residual;
+        rr[i] = counted * counted;
+        count[i] = counts;
     }
-    std::array::from_fn(|i| if i < 7 { sums.total(i) } else { 0.0 })
+    let mut sums = [0.0; 8];
+    for (sum, part) in sums.iter_mut().zip(&parts) {
+        *sum = total(part);
+    }
+    sums
 }
 
-/// Values along row `y` of small pixels of the middle one of 3 × 3 blocks, linear between their centres.
+/// Values at the small pixels of the middle one of 3 × 3 blocks, linear between their centres.
 #[inline(always)]
-fn between(blocks: &[[f32; 3]; 3], y: usize) -> Row {
-    let axis = |at: usize| {
-        let place = 0.5 + (at as f32 + 0.5) / SMALL_PER_BLOCK as f32;
-        (usize::from(place >= 1.0), place - if place >= 1.0 { 1.0 } else { 0.0 })
-    };
-    let (j, fy) = axis(y);
-    let line: [f32; 3] = std::array::from_fn(|i| blocks[j][i] + (blocks[j + 1][i] - blocks[j][i]) * fy);
-    lanes(|x| {
-        let (i, fx) = axis(x);
-        line[i] + (line[i + 1] - line[i]) * fx
-    })
+fn between(blocks: &[[f32; 3]; 3]) -> Plane {
+    const SIDE: usize = SMALL_PER_BLOCK;
+    let mut plane = EMPTY;
+    for (y, row) in plane.chunks_exact_mut(SIDE).enumerate() {
+        let (j, fy) = axis(y);
+        let mut line = [0.0; 3];
+        for (i, value) in line.iter_mut().enumerate() {
+            *value = blocks[j][i] + (blocks[j + 1][i] - blocks[j][i]) * fy;
+        }
+        for (x, value) in row.iter_mut().enumerate() {
+            let (i, fx) = axis(x);
+            *value = line[i] + (line[i + 1] - line[i]) * fx;
+        }
+    }
+    plane
+}
+
+/// Between which of three blocks' centres a pixel of the middle block lies, and how near it is to the second.
+#[inline(always)]
+fn axis(at: usize) -> (usize, f32) {
+    let place = 0.5 + (at as i32 as f32 + 0.5) / SMALL_PER_BLOCK as f32;
+    if at < SMALL_PER_BLOCK / 2 {
+        (0, place)
+    } else {
+        (1, place - 1.0)
+    }
 }
 
 #[cfg(test)]
