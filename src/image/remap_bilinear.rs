@@ -42,10 +42,10 @@ mod avx2 {
     use std::arch::x86_64::{
         __m128i, __m256i, _mm_blend_epi32, _mm_cvtsi64_si128, _mm_set1_epi64x, _mm256_add_epi32, _mm256_and_si256,
         _mm256_andnot_si256, _mm256_blend_epi32, _mm256_broadcastsi128_si256, _mm256_castsi128_si256, _mm256_cmpeq_epi32,
-        _mm256_extract_epi64, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_max_epu32, _mm256_movemask_epi8,
-        _mm256_or_si256, _mm256_packus_epi16, _mm256_packus_epi32, _mm256_permutevar8x32_epi32, _mm256_set1_epi32,
-        _mm256_setr_epi8, _mm256_setr_epi32, _mm256_setzero_si256, _mm256_shuffle_epi8, _mm256_shuffle_epi32,
-        _mm256_slli_epi32, _mm256_srli_epi32, _mm256_sub_epi32,
+        _mm256_extract_epi64, _mm256_madd_epi16, _mm256_maddubs_epi16, _mm256_max_epu32, _mm256_movemask_epi8, _mm256_or_si256,
+        _mm256_packus_epi16, _mm256_packus_epi32, _mm256_permutevar8x32_epi32, _mm256_set1_epi32, _mm256_setr_epi8,
+        _mm256_setr_epi32, _mm256_setzero_si256, _mm256_shuffle_epi8, _mm256_shuffle_epi32, _mm256_slli_epi32, _mm256_srli_epi32,
+        _mm256_sub_epi32,
     };
 
     use crate::image::buffer::{Image, Rgb8};
