@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::components::set_runs;
-use crate::image::specularity::background::extreme_over_square;
+use crate::image::specularity::background::{extreme_over_square, lower};
 use crate::image::specularity::cells::Cells;
 use crate::image::wide::{self, Kernel};
 
@@ -59,7 +59,7 @@ impl Classifier {
     pub fn candidates(&mut self, demand: &Demand<'_>, cells: &Cells, steel: &Mask, out: &mut Mask) {
         self.lowest.copy_from(demand.level);
         // Bounds are interpolated between a cell and its neighbours.
-        extreme_over_square(&mut self.lowest, 1, f32::min, f32::INFINITY, &mut self.scratch);
+        extreme_over_square(&mut self.lowest, 1, lower, f32::INFINITY, &mut self.scratch);
         out.copy_from(steel);
         let found = cells.peak.pixels().iter().zip(self.lowest.pixels());
         for (out, (&peak, lowest)) in out.pixels_mut().iter_mut().zip(found) {
@@ -189,7 +189,6 @@ impl Stretch<'_> {
                 most[i] = r.max(g).max(b);
             }
             let (part, whiteness) = (place.fract(), self.demand.whiteness);
-            let lower = |a: f32, b: f32| if a < b { a } else { b };
             let higher = |a: f32, b: f32| if a > b { a } else { b };
             // 255 for all above zero: the sign spread over the number, where a comparison would be taken apart lane by lane.
             let met = |by: f32| (((0.0 - by).to_bits() as i32) >> 31) as u8;

@@ -39,7 +39,7 @@ pub struct SpecularityDetector {
     /// From the nearest core; beyond every limit outside `near_cells`.
     distance: Image<u16>,
     components: Components,
-    /// Per region: core pixels, nearly clipped pixels.
+    /// Per region: core pixels, as far as they decide, and in large ones nearly clipped pixels.
     counts: Vec<[u32; 2]>,
     scratch: BlurScratch,
 }
@@ -147,21 +147,24 @@ impl SpecularityDetector {
         self.components.label(&self.halos);
         self.counts.clear();
         self.counts.resize(self.components.regions().len(), [0, 0]);
+        let max_area = self.settings.max_region_share * (width * height) as f32;
+        let is_large = |label: usize| self.components.regions()[label].area as f32 > max_area;
         for run in self.components.runs() {
             let first = run.y as usize * width;
             let pixels = first + run.begin as usize..first + run.end as usize;
-            let cores = self.cores.pixels()[pixels.clone()].iter().filter(|core| **core != 0);
-            let clipped = image.pixels()[pixels]
-                .iter()
-                .filter(|color| color.iter().all(|level| *level >= NEARLY_CLIPPED_LEVEL));
-            let count = &mut self.counts[run.label as usize];
-            *count = [count[0] + cores.count() as u32, count[1] + clipped.count() as u32];
+            let [cores, clipped] = &mut self.counts[run.label as usize];
+            if *cores < MIN_CORE_PX {
+                *cores += self.cores.pixels()[pixels.clone()].iter().filter(|core| **core != 0).count() as u32;
+            }
+            if is_large(run.label as usize) {
+                let is_clipped = |color: &&Rgb8| color.iter().all(|level| *level >= NEARLY_CLIPPED_LEVEL);
+                *clipped += image.pixels()[pixels].iter().filter(is_clipped).count() as u32;
+            }
         }
-        let max_area = self.settings.max_region_share * (width * height) as f32;
         let counts = &self.counts;
         self.components.paint(specular, 255, |label, region| {
             let [cores, clipped] = counts[label];
-            let plausible = region.area as f32 <= max_area || clipped as f32 > MIN_CLIPPED_SHARE * region.area as f32;
+            let plausible = !is_large(label) || clipped as f32 > MIN_CLIPPED_SHARE * region.area as f32;
             cores >= MIN_CORE_PX && plausible
         });
     }

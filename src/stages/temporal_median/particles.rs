@@ -120,11 +120,16 @@ impl Particles {
             for member in blob.first..blob.first + blob.count {
                 let at = self.members[member] as usize;
                 let (x, y) = (at % width, at / width);
-                for ny in y.saturating_sub(GROW)..(y + GROW + 1).min(height) {
-                    for nx in x.saturating_sub(GROW)..(x + GROW + 1).min(width) {
-                        self.marks[ny * width + nx] |= mark;
-                        self.busy[ny / BLOCK * columns + nx / BLOCK] = true;
+                let (left, right) = (x.saturating_sub(GROW), (x + GROW).min(width - 1));
+                let (top, bottom) = (y.saturating_sub(GROW), (y + GROW).min(height - 1));
+                for row in top..=bottom {
+                    for near in &mut self.marks[row * width + left..=row * width + right] {
+                        *near |= mark;
                     }
+                }
+                for row in [top / BLOCK, bottom / BLOCK] {
+                    self.busy[row * columns + left / BLOCK] = true;
+                    self.busy[row * columns + right / BLOCK] = true;
                 }
             }
         }
@@ -141,11 +146,18 @@ impl Particles {
             self.suspect = vec![0; blocks];
             self.busy = vec![false; blocks];
         }
-        // Only around the last frame's members there are marks.
-        for member in &self.members {
-            let (x, y) = (*member as usize % width, *member as usize / width);
-            for row in y.saturating_sub(GROW)..(y + GROW + 1).min(height) {
-                self.marks[row * width + x.saturating_sub(GROW)..row * width + (x + GROW + 1).min(width)].fill(0);
+        // All marks of the last frame lie in its busy blocks.
+        let columns = width.div_ceil(BLOCK);
+        for (block, _) in self.busy.iter().enumerate().filter(|(_, busy)| **busy) {
+            let (left, top) = (block % columns * BLOCK, block / columns * BLOCK);
+            for y in top..(top + BLOCK).min(height) {
+                match self.marks[y * width + left..]
+                    .first_chunk_mut::<BLOCK>()
+                    .filter(|_| left + BLOCK <= width)
+                {
+                    Some(marks) => *marks = [0; BLOCK],
+                    None => self.marks[y * width + left..(y + 1) * width].fill(0),
+                }
             }
         }
         self.suspect.fill(0);
