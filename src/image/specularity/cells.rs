@@ -147,29 +147,32 @@ impl Kernel for CellRow<'_> {
             // The cells of a 1080p picture are of a size that the compiler knows.
             let (first, cells) = (left / step, n / step);
             let range = first..first + cells;
-            let out = (
-                &mut least[range.clone()],
-                &mut most[range.clone()],
-                &mut rgb[range.clone()],
-                &mut peak[range],
-            );
+            let found = Found {
+                least: &mut least[range.clone()],
+                most: &mut most[range.clone()],
+                rgb: &mut rgb[range.clone()],
+                peak: &mut peak[range],
+            };
             if step == 8 {
-                finish::<8>(&sums, &peaks, step, out);
+                finish::<8>(&sums, &peaks, step, found);
             } else {
-                finish::<0>(&sums, &peaks, step, out);
+                finish::<0>(&sums, &peaks, step, found);
             }
         }
     }
 }
 
+/// Of neighbouring cells.
+struct Found<'a> {
+    least: &'a mut [f32],
+    most: &'a mut [f32],
+    rgb: &'a mut [[f32; 3]],
+    peak: &'a mut [u8],
+}
+
 /// Means and peaks of cells from the sums and peaks of their columns; `STEP` is `step` or 0.
 #[inline(always)]
-fn finish<const STEP: usize>(
-    sums: &[[u16; CHUNK]; 5],
-    peaks: &[u8; CHUNK],
-    step: usize,
-    (least, most, rgb, peak): (&mut [f32], &mut [f32], &mut [[f32; 3]], &mut [u8]),
-) {
+fn finish<const STEP: usize>(sums: &[[u16; CHUNK]; 5], peaks: &[u8; CHUNK], step: usize, found: Found<'_>) {
     let step = if STEP > 0 { STEP } else { step };
     let scale = 1.0 / (step * step) as f32;
     let mut means = [[0.0; CHUNK]; 5];
@@ -182,18 +185,18 @@ fn finish<const STEP: usize>(
             *mean = total as f32 * scale;
         }
     }
-    for (peak, peaks) in peak.iter_mut().zip(peaks.chunks_exact(step)) {
+    for (peak, peaks) in found.peak.iter_mut().zip(peaks.chunks_exact(step)) {
         let mut highest = 0_u8;
         for value in peaks {
             highest = highest.max(*value);
         }
         *peak = highest;
     }
-    let [a, b, c, d, e] = &means;
-    for i in 0..least.len().min(CHUNK) {
-        least[i] = a[i];
-        most[i] = b[i];
-        rgb[i] = [c[i], d[i], e[i]];
+    let [least, most, red, green, blue] = &means;
+    for i in 0..found.least.len().min(CHUNK) {
+        found.least[i] = least[i];
+        found.most[i] = most[i];
+        found.rgb[i] = [red[i], green[i], blue[i]];
     }
 }
 
