@@ -1,22 +1,24 @@
-//! Blurs of single-channel f32 images with cost independent of the radius.
+//! Blurs of single-channel f32 images with a cost that hardly depends on the radius.
 //!
-//! A running sum goes from pixel to pixel, so one row keeps only one lane of a vector register busy. Therefore rows are treated
-//! [`LANES`] at a time, transposed into a strip that stays in the cache for all passes; columns need no transposing.
+//! Columns: running sums go from row to row, in strips of columns that stay in the cache for all passes. Rows: a running sum would keep
+//! only one lane of a vector register busy, so a window's sum is put together from those of 1, 2, 4, … pixels, each made by adding the
+//! one before to itself, shifted. Beyond the border stand zeros, and each place has its own share to scale by.
 
 use crate::image::buffer::Image;
 use crate::image::wide::{self, Kernel};
 
-/// Rows, or columns, treated together.
-const LANES: usize = 16;
-
-/// One value of each of the rows (columns) treated together.
-type Lanes = [f32; LANES];
+/// Columns treated together.
+const STRIP: usize = 64;
 
 /// Working memory of [`box_blur`]; keep it between calls so that nothing is allocated.
 #[derive(Debug, Default)]
 pub struct BlurScratch {
-    strip: Vec<Lanes>,
-    blurred: Vec<Lanes>,
+    strips: [Vec<f32>; 2],
+    /// Of the columns treated together.
+    sums: Vec<f32>,
+    rows: [Vec<f32>; 4],
+    /// One over the number of places in the window around each place.
+    shares: Vec<f32>,
 }
 
 /// Mean over a (2·radius + 1)² square, in place; at the border the mean of what lies inside the image.
@@ -37,12 +39,27 @@ fn repeated_box_blur(image: &mut Image<f32>, radius: usize, passes: usize, scrat
     if radius == 0 || width == 0 || height == 0 {
         return;
     }
-    let longest = width.max(height);
-    if scratch.strip.len() < longest {
-        scratch.strip.resize(longest, [0.0; LANES]);
-        scratch.blurred.resize(longest, [0.0; LANES]);
+    let strip_len = STRIP * (height + 2 * radius + 1);
+    for strip in &mut scratch.strips {
+        if strip.len() < strip_len {
+            strip.resize(strip_len, 0.0);
+        }
     }
-    wide::run(BothWays {
+    scratch.sums.resize(STRIP, 0.0);
+    for row in &mut scratch.rows {
+        if row.len() < width + 2 * radius {
+            row.resize(width + 2 * radius, 0.0);
+        }
+    }
+    set_shares(&mut scratch.shares, width, radius);
+    wide::run(AlongRows {
+        image,
+        radius,
+        passes,
+        scratch,
+    });
+    set_shares(&mut scratch.shares, height, radius);
+    wide::run(AlongColumns {
         image,
         radius,
         passes,
@@ -50,132 +67,126 @@ fn repeated_box_blur(image: &mut Image<f32>, radius: usize, passes: usize, scrat
     });
 }
 
-struct BothWays<'a> {
+fn set_shares(shares: &mut Vec<f32>, n: usize, radius: usize) {
+    shares.clear();
+    let count = |at: usize| (at + radius).min(n - 1) + 1 - at.saturating_sub(radius);
+    shares.extend((0..n).map(|at| 1.0 / count(at) as f32));
+}
+
+struct AlongRows<'a> {
     image: &'a mut Image<f32>,
     radius: usize,
     passes: usize,
     scratch: &'a mut BlurScratch,
 }
 
-impl Kernel for BothWays<'_> {
+impl Kernel for AlongRows<'_> {
     #[inline(always)]
     fn run(self) {
-        let Self {
-            image,
-            radius,
-            passes,
-            scratch,
-        } = self;
-        let (width, height) = image.size();
-        let BlurScratch { strip, blurred } = scratch;
-        let (strip, blurred) = (&mut strip[..width.max(height)], &mut blurred[..width.max(height)]);
-        for rows in image.pixels_mut().chunks_mut(LANES * width) {
-            for left in (0..width).step_by(LANES) {
-                for (lane, row) in rows.chunks_exact(width).enumerate().take(LANES) {
-                    match row[left..].first_chunk::<LANES>() {
-                        Some(values) => (0..LANES).for_each(|i| strip[left + i][lane] = values[i]),
-                        None => (left..width).for_each(|x| strip[x][lane] = row[x]),
+        let width = self.image.width();
+        let padded = width + 2 * self.radius;
+        let BlurScratch {
+            rows: [values, sums, doubled, window],
+            shares,
+            ..
+        } = self.scratch;
+        let (values, window) = (&mut values[..padded], &mut window[..width]);
+        let (mut sums, mut doubled) = (&mut sums[..padded], &mut doubled[..padded]);
+        values.fill(0.0);
+        for row in self.image.pixels_mut().chunks_exact_mut(width) {
+            values[self.radius..][..width].copy_from_slice(row);
+            for _ in 0..self.passes {
+                // The window's first pixel, then twos, fours, … as the bits of its length say.
+                window.copy_from_slice(&values[..width]);
+                let (mut covered, mut span) = (1, 1);
+                while covered < 2 * self.radius + 1 {
+                    let shorter: &[f32] = if span == 1 { values } else { sums };
+                    for ((doubled, a), b) in doubled.iter_mut().zip(shorter).zip(&shorter[span..]) {
+                        *doubled = a + b;
+                    }
+                    std::mem::swap(&mut sums, &mut doubled);
+                    span *= 2;
+                    if (2 * self.radius + 1) & span != 0 {
+                        for (window, sum) in window.iter_mut().zip(&sums[covered..]) {
+                            *window += sum;
+                        }
+                        covered += span;
                     }
                 }
-            }
-            boxes(&mut strip[..width], &mut blurred[..width], radius, passes);
-            for left in (0..width).step_by(LANES) {
-                for (lane, row) in rows.chunks_exact_mut(width).enumerate().take(LANES) {
-                    match row[left..].first_chunk_mut::<LANES>() {
-                        Some(values) => (0..LANES).for_each(|i| values[i] = blurred[left + i][lane]),
-                        None => (left..width).for_each(|x| row[x] = blurred[x][lane]),
-                    }
+                let means = values[self.radius..][..width].iter_mut();
+                for ((mean, sum), share) in means.zip(window.iter()).zip(shares.iter()) {
+                    *mean = sum * share;
                 }
             }
-        }
-        for left in (0..width).step_by(LANES) {
-            for (place, row) in strip.iter_mut().zip(image.pixels().chunks_exact(width)) {
-                match row[left..].first_chunk::<LANES>() {
-                    Some(values) => *place = *values,
-                    None => place[..width - left].copy_from_slice(&row[left..]),
-                }
-            }
-            boxes(&mut strip[..height], &mut blurred[..height], radius, passes);
-            for (place, row) in blurred.iter().zip(image.pixels_mut().chunks_exact_mut(width)) {
-                match row[left..].first_chunk_mut::<LANES>() {
-                    Some(values) => *values = *place,
-                    None => row[left..].copy_from_slice(&place[..width - left]),
-                }
-            }
+            row.copy_from_slice(&values[self.radius..][..width]);
         }
     }
 }
 
-/// An odd number of box means along a strip, from `strip` into `out`; `strip` is used up.
-#[inline(always)]
-fn boxes(strip: &mut [Lanes], out: &mut [Lanes], radius: usize, passes: usize) {
-    box_mean(strip, out, radius);
-    for _ in 1..passes.div_ceil(2) {
-        box_mean(out, strip, radius);
-        box_mean(strip, out, radius);
-    }
+struct AlongColumns<'a> {
+    image: &'a mut Image<f32>,
+    radius: usize,
+    passes: usize,
+    scratch: &'a mut BlurScratch,
 }
 
-/// Mean over 2·radius + 1 places; at the ends over those that there are.
-#[inline(always)]
-fn box_mean(source: &[Lanes], out: &mut [Lanes], radius: usize) {
-    let n = source.len();
-    let mut sum = [0.0; LANES];
-    for place in source.iter().take(radius) {
-        add(&mut sum, place);
-    }
-    // Entering, whole and leaving stretches have no decisions to make inside.
-    let whole = 1.0 / (2 * radius + 1) as f32;
-    let (inner_begin, inner_end) = (radius + 1, n.saturating_sub(radius));
-    let ends = (0..n.min(inner_begin)).chain(inner_end.max(inner_begin).min(n)..n);
-    let end = |at: usize, sum: &mut Lanes, out: &mut [Lanes]| {
-        if at + radius < n {
-            add(sum, &source[at + radius]);
-        }
-        if at > radius {
-            subtract(sum, &source[at - radius - 1]);
-        }
-        let count = (at + radius).min(n - 1) + 1 - at.saturating_sub(radius);
-        out[at] = scaled(sum, 1.0 / count as f32);
-    };
-    for at in ends.clone().take_while(|at| *at < inner_begin) {
-        end(at, &mut sum, out);
-    }
-    if inner_begin < inner_end {
-        let entering = &source[inner_begin + radius..];
-        // A copy that nothing points to can stay in registers.
-        let mut running = sum;
-        for ((out, entering), leaving) in out[inner_begin..inner_end].iter_mut().zip(entering).zip(source) {
-            for lane in 0..LANES {
-                // The difference first: the sum then waits for one addition a step, not for two.
-                running[lane] += entering[lane] - leaving[lane];
-                out[lane] = running[lane] * whole;
+impl Kernel for AlongColumns<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let (width, height) = self.image.size();
+        // One row more above: what leaves the window at the first place.
+        let (above, padded) = (self.radius + 1, height + 2 * self.radius + 1);
+        let BlurScratch {
+            strips: [strip, other],
+            sums,
+            shares,
+            ..
+        } = self.scratch;
+        for left in (0..width).step_by(STRIP) {
+            let columns = STRIP.min(width - left);
+            let inner = columns * above..columns * (above + height);
+            let (mut strip, mut other) = (&mut strip[..columns * padded], &mut other[..columns * padded]);
+            for strip in [&mut *strip, &mut *other] {
+                strip[..inner.start].fill(0.0);
+                strip[inner.end..].fill(0.0);
+            }
+            let rows = self.image.pixels().chunks_exact(width);
+            for (place, row) in strip[inner.clone()].chunks_exact_mut(columns).zip(rows) {
+                place.copy_from_slice(&row[left..left + columns]);
+            }
+            for _ in 0..self.passes {
+                box_mean(strip, &mut other[inner.clone()], &mut sums[..columns], self.radius, shares);
+                std::mem::swap(&mut strip, &mut other);
+            }
+            let rows = self.image.pixels_mut().chunks_exact_mut(width);
+            for (place, row) in strip[inner].chunks_exact(columns).zip(rows) {
+                row[left..left + columns].copy_from_slice(place);
             }
         }
-        sum = running;
-    }
-    for at in ends.skip_while(|at| *at < inner_begin) {
-        end(at, &mut sum, out);
     }
 }
 
+/// Mean over 2·radius + 1 rows of as many columns as there are `sums`; `padded` has radius + 1 more rows before the first and radius
+/// after the last.
 #[inline(always)]
-fn add(sum: &mut Lanes, place: &Lanes) {
-    for lane in 0..LANES {
-        sum[lane] += place[lane];
+fn box_mean(padded: &[f32], out: &mut [f32], sums: &mut [f32], radius: usize, shares: &[f32]) {
+    let columns = sums.len();
+    let window = columns * (2 * radius + 1);
+    sums.fill(0.0);
+    for row in padded[..window].chunks_exact(columns) {
+        for (sum, value) in sums.iter_mut().zip(row) {
+            *sum += value;
+        }
     }
-}
-
-#[inline(always)]
-fn subtract(sum: &mut Lanes, place: &Lanes) {
-    for lane in 0..LANES {
-        sum[lane] -= place[lane];
+    let entering = padded[window..].chunks_exact(columns);
+    let rows = out.chunks_exact_mut(columns).zip(padded.chunks_exact(columns)).zip(entering);
+    for (((out, leaving), entering), share) in rows.zip(shares) {
+        let values = out.iter_mut().zip(sums.iter_mut()).zip(leaving.iter().zip(entering));
+        for ((out, sum), (leaving, entering)) in values {
+            *sum += entering - leaving;
+            *out = *sum * share;
+        }
     }
-}
-
-#[inline(always)]
-fn scaled(sum: &Lanes, scale: f32) -> Lanes {
-    std::array::from_fn(|lane| sum[lane] * scale)
 }
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 //! Connected components of a mask (8-neighbourhood), labelled by runs without allocation once warm.
 
+use std::ops::Range;
+
 use crate::image::buffer::{Image, Mask};
 
 /// A horizontal run of set pixels, and the component it belongs to.
@@ -86,18 +88,15 @@ impl Components {
     }
 
     fn collect_runs(&mut self, row: &[u8], y: u32) {
-        let mut x = 0;
-        while let Some(begin) = next_set(row, x) {
-            let end = next_clear(row, begin);
+        for run in set_runs(row) {
             let label = self.parents.len() as u32;
             self.parents.push(label);
             self.runs.push(Run {
                 y,
-                begin: begin as u32,
-                end: end as u32,
+                begin: run.start as u32,
+                end: run.end as u32,
                 label,
             });
-            x = end;
         }
     }
 
@@ -142,6 +141,16 @@ impl Components {
             self.runs[index].label = number;
         }
     }
+}
+
+/// The runs of set pixels of a row.
+pub(crate) fn set_runs(row: &[u8]) -> impl Iterator<Item = Range<usize>> {
+    let mut from = 0;
+    std::iter::from_fn(move || {
+        let begin = next_set(row, from)?;
+        from = next_clear(row, begin);
+        Some(begin..from)
+    })
 }
 
 /// Bytes looked at in one step.

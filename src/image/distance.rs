@@ -3,7 +3,10 @@
 //! The pass along a row hands the distance on from pixel to pixel, which a processor does one by one. Up to [`LARGEST_FAST_LIMIT`] it
 //! is done by doubling instead: after rounds with the neighbours 1, 2, 4, … px away every pixel knows all as far as the limit reaches.
 
+use std::ops::Range;
+
 use crate::image::buffer::{Image, Mask};
+use crate::image::components::set_runs;
 use crate::image::wide::{self, Kernel};
 
 /// Chamfer units a pixel: a horizontal step costs 3, a diagonal one 4.
@@ -26,20 +29,54 @@ pub fn chamfer_distance(mask: &Mask, limit: u16, out: &mut Image<u16>) {
         out.resize(mask.width(), mask.height(), limit);
     }
     if mask.width() > 0 {
-        wide::run(TwoPasses { mask, limit, out });
+        wide::run(TwoPasses {
+            cells: None,
+            mask,
+            limit,
+            out,
+        });
+    }
+}
+
+/// The same for the pixels of the set cells, of `step` px; other pixels of `out` must hold `limit` or more and are left as they are.
+/// Distances are right where every shortest way to the mask stays inside the set cells, and the mask must do so too. `out` must be of the
+/// mask's size.
+pub fn chamfer_distance_within((cells, step): (&Mask, usize), mask: &Mask, limit: u16, out: &mut Image<u16>) {
+    if mask.width() > 0 && out.size() == mask.size() {
+        wide::run(TwoPasses {
+            cells: Some((cells, step)),
+            mask,
+            limit,
+            out,
+        });
     }
 }
 
 struct TwoPasses<'a> {
+    /// Where, and the size of a cell; everywhere if `None`.
+    cells: Option<(&'a Mask, usize)>,
     mask: &'a Mask,
     limit: u16,
     out: &'a mut Image<u16>,
 }
 
+impl TwoPasses<'_> {
+    /// Where row `y` is looked at.
+    #[inline(always)]
+    fn stretches(cells: Option<(&Mask, usize)>, width: usize, y: usize) -> impl Iterator<Item = Range<usize>> {
+        let everywhere = if cells.is_none() { Some(0..width) } else { None };
+        let some = cells.into_iter().flat_map(move |(cells, step)| {
+            let row = cells.row((y / step).min(cells.height() - 1));
+            set_runs(row).map(move |run| run.start * step..if run.end == row.len() { width } else { run.end * step })
+        });
+        everywhere.into_iter().chain(some)
+    }
+}
+
 impl Kernel for TwoPasses<'_> {
     #[inline(always)]
     fn run(self) {
-        let Self { mask, limit, out } = self;
+        let Self { cells, mask, limit, out } = self;
         let (width, height) = mask.size();
         let mut pass = Pass {
             limit,
@@ -49,47 +86,56 @@ impl Kernel for TwoPasses<'_> {
         let mut above_tells = false;
         for y in 0..height {
             let (before, rest) = out.pixels_mut().split_at_mut(y * width);
-            let row = &mut rest[..width];
-            let mut set = 0;
-            for (distance, &value) in row.iter_mut().zip(mask.row(y)) {
-                *distance = if value != 0 { 0 } else { limit };
-                set |= value;
+            let mut tells = false;
+            for stretch in Self::stretches(cells, width, y) {
+                let row = &mut rest[stretch.clone()];
+                let mut set = 0;
+                for (distance, &value) in row.iter_mut().zip(&mask.row(y)[stretch.clone()]) {
+                    *distance = if value != 0 { 0 } else { limit };
+                    set |= value;
+                }
+                if above_tells {
+                    from_neighbour(row, &before[(y - 1) * width..], stretch);
+                }
+                if set != 0 || above_tells {
+                    pass.rightward(row);
+                    tells |= row.iter().fold(limit, |least, d| least.min(*d)) < limit;
+                }
             }
-            if above_tells {
-                from_neighbour(row, &before[(y - 1) * width..]);
-            }
-            if set != 0 || above_tells {
-                pass.rightward(row);
-                above_tells = row.iter().fold(limit, |least, d| least.min(*d)) < limit;
-            }
+            above_tells = tells;
         }
         let mut below_tells = false;
         for y in (0..height).rev() {
             let (before, rest) = out.pixels_mut().split_at_mut((y + 1) * width);
-            let row = &mut before[y * width..];
-            if below_tells {
-                from_neighbour(row, &rest[..width]);
+            let mut row_tells = false;
+            for stretch in Self::stretches(cells, width, y) {
+                let row = &mut before[y * width..][stretch.clone()];
+                if below_tells {
+                    from_neighbour(row, &rest[..width], stretch);
+                }
+                let tells = row.iter().fold(limit, |least, d| least.min(*d)) < limit;
+                if tells {
+                    pass.leftward(row);
+                }
+                row_tells |= tells;
             }
-            let tells = row.iter().fold(limit, |least, d| least.min(*d)) < limit;
-            if tells {
-                pass.leftward(row);
-            }
-            below_tells = tells;
+            below_tells = row_tells;
         }
     }
 }
 
-/// The steps down (or up) and diagonally. Distances are at most the limit, so that adding does not overflow unless the limit is
-/// next to the largest number there is.
+/// The steps down (or up) and diagonally, to a stretch of a row from the whole row `other`. Distances are at most the limit, so that
+/// adding does not overflow unless the limit is next to the largest number there is.
 #[inline(always)]
-fn from_neighbour(row: &mut [u16], other: &[u16]) {
-    for (distance, other) in row.iter_mut().zip(other) {
+fn from_neighbour(row: &mut [u16], other: &[u16], stretch: Range<usize>) {
+    for (distance, other) in row.iter_mut().zip(&other[stretch.clone()]) {
         *distance = (*distance).min(other.saturating_add(UNITS_PER_PX));
     }
-    for (distance, other) in row[1..].iter_mut().zip(other) {
+    let first = usize::from(stretch.start == 0);
+    for (distance, other) in row[first..].iter_mut().zip(&other[stretch.start + first - 1..]) {
         *distance = (*distance).min(other.saturating_add(DIAGONAL));
     }
-    for (distance, other) in row.iter_mut().zip(&other[1..]) {
+    for (distance, other) in row.iter_mut().zip(&other[stretch.start + 1..]) {
         *distance = (*distance).min(other.saturating_add(DIAGONAL));
     }
 }
@@ -257,5 +303,35 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn within_cells_agrees_with_everywhere() {
+        let (width, height, step) = (150, 61, 7);
+        let mut mask = Image::filled(width, height, 0);
+        for (x, y) in [(3, 2), (80, 30), (84, 31), (149, 60)] {
+            mask.set(x, y, 255);
+        }
+        let (limit, reach) = (31, 11);
+        let mut everywhere = Image::filled(0, 0, 0);
+        chamfer_distance(&mask, limit, &mut everywhere);
+        let (across, down) = (width / step, height / step);
+        let mut cells = Image::filled(across, down, 0);
+        for y in 0..height {
+            for x in 0..width {
+                let near = |x: usize, y: usize| x < width && y < height && mask.at(x, y) != 0;
+                let reached =
+                    (y.saturating_sub(reach)..=y + reach).any(|v| (x.saturating_sub(reach)..=x + reach).any(|u| near(u, v)));
+                if reached {
+                    cells.set((x / step).min(across - 1), (y / step).min(down - 1), 255);
+                }
+            }
+        }
+        let mut within = Image::filled(width, height, u16::MAX);
+        chamfer_distance_within((&cells, step), &mask, limit, &mut within);
+        for (found, expected) in within.pixels().iter().zip(everywhere.pixels()) {
+            assert_eq!((*found).min(limit), *expected);
+        }
+        assert!(within.pixels().contains(&u16::MAX));
     }
 }

@@ -18,7 +18,7 @@ pub const STEPS_PER_PX: i64 = 32;
 pub(crate) const BLOCK: usize = 64;
 /// This output pixel has no four neighbours in the source.
 pub(crate) const OUTSIDE: u32 = u32::MAX;
-const FRACTION_BITS: u32 = 10;
+pub(crate) const FRACTION_BITS: u32 = 10;
 const LARGEST_INDEX: u32 = (1 << (32 - FRACTION_BITS)) - 2;
 /// Rows that one task of the thread pool treats.
 const ROWS_PER_BAND: usize = 32;

@@ -78,14 +78,20 @@ impl Background {
             *weight = if known { 1.0 } else { 0.0 };
         }
         for limit in ROUNDS {
-            self.blur(cells, sigma, scratch);
+            self.blur_weight(sigma, scratch);
+            self.least.copy_from(&cells.least);
+            weighted_mean(&mut self.least, &self.weight, &self.blurred_weight, sigma, scratch);
             let levels = cells.least.pixels().iter().zip(self.least.pixels());
             for ((weight, known), (level, mean)) in self.weight.pixels_mut().iter_mut().zip(known()).zip(levels) {
                 let usual = if level - mean < limit { 1.0 } else { SAY_OF_EXCEPTIONS };
                 *weight = if known { usual } else { 0.0 };
             }
         }
-        self.blur(cells, sigma, scratch);
+        self.blur_weight(sigma, scratch);
+        for (mean, levels) in [(&mut self.least, &cells.least), (&mut self.most, &cells.most)] {
+            mean.copy_from(levels);
+            weighted_mean(mean, &self.weight, &self.blurred_weight, sigma, scratch);
+        }
         // Mean absolute deviation of the unexceptional cells.
         self.spread.copy_from(&cells.least);
         for (spread, mean) in self.spread.pixels_mut().iter_mut().zip(self.least.pixels()) {
@@ -96,13 +102,9 @@ impl Background {
         self.set_bounds(settings, brightness);
     }
 
-    fn blur(&mut self, cells: &Cells, sigma: f32, scratch: &mut BlurScratch) {
+    fn blur_weight(&mut self, sigma: f32, scratch: &mut BlurScratch) {
         self.blurred_weight.copy_from(&self.weight);
         gaussian_blur(&mut self.blurred_weight, sigma, scratch);
-        for (mean, levels) in [(&mut self.least, &cells.least), (&mut self.most, &cells.most)] {
-            mean.copy_from(levels);
-            weighted_mean(mean, &self.weight, &self.blurred_weight, sigma, scratch);
-        }
     }
 
     /// Opening: erosion, then dilation, by squares; invalid cells take no part in the erosion.
@@ -117,8 +119,8 @@ impl Background {
                 *opened = if *valid != 0 { *opened } else { 255.0 };
             }
             // The blurred weight is not needed any more.
-            extreme_over_square(opened, radius, f32::min, 255.0, &mut self.blurred_weight);
-            extreme_over_square(opened, radius, f32::max, 0.0, &mut self.blurred_weight);
+            extreme_over_square(opened, radius, lower, 255.0, &mut self.blurred_weight);
+            extreme_over_square(opened, radius, higher, 0.0, &mut self.blurred_weight);
         }
     }
 
@@ -164,13 +166,22 @@ fn weighted_mean(
     }
 }
 
+/// The lower of two numbers; unlike `f32::min` a single instruction.
+pub(super) fn lower(a: f32, b: f32) -> f32 {
+    if b < a { b } else { a }
+}
+
+fn higher(a: f32, b: f32) -> f32 {
+    if b > a { b } else { a }
+}
+
 /// The extreme over a (2·radius + 1)² square, in place; `neutral` stands for what lies outside.
-fn extreme_over_square(
-    image: &mut Image<f32>,
+pub(super) fn extreme_over_square<P: Copy>(
+    image: &mut Image<P>,
     radius: usize,
-    pick: impl Fn(f32, f32) -> f32,
-    neutral: f32,
-    rows: &mut Image<f32>,
+    pick: impl Fn(P, P) -> P,
+    neutral: P,
+    rows: &mut Image<P>,
 ) {
     let (width, height) = image.size();
     if rows.size() != image.size() {

@@ -1,4 +1,4 @@
-//! The picture averaged over square cells, and the darkest and the brightest channel of every pixel.
+//! The picture averaged over square cells, and how bright the darkest channel gets in each.
 
 use rayon::prelude::*;
 
@@ -20,17 +20,10 @@ pub(super) struct Cells {
     pub most: Image<f32>,
     /// Of the channels.
     pub rgb: Image<[f32; 3]>,
+    /// The highest min(R, G, B) of the cell's pixels; 255 where pixels that are in no cell lie beside it.
+    pub peak: Image<u8>,
     /// 255 where the cell lies inside the image field and is not all but black.
     pub valid: Mask,
-}
-
-/// One value per pixel of the picture.
-#[derive(Debug, Default)]
-pub(super) struct Extremes {
-    /// min(R, G, B).
-    pub least: Vec<u8>,
-    /// max(R, G, B).
-    pub most: Vec<u8>,
 }
 
 impl Cells {
@@ -39,6 +32,7 @@ impl Cells {
             least: Image::filled(0, 0, 0.0),
             most: Image::filled(0, 0, 0.0),
             rgb: Image::filled(0, 0, [0.0; 3]),
+            peak: Image::filled(0, 0, 0),
             valid: Image::filled(0, 0, 0),
         }
     }
@@ -48,34 +42,32 @@ impl Cells {
     }
 
     /// Average over cells of `step` px, at most [`CHUNK`]; what is left over at the right and at the bottom is in no cell.
-    pub fn average(&mut self, image: &Image<Rgb8>, field: Option<&Mask>, step: usize, extremes: &mut Extremes) {
-        let (width, pixels) = (image.width(), image.pixels().len());
+    pub fn average(&mut self, image: &Image<Rgb8>, field: Option<&Mask>, step: usize) {
+        let width = image.width();
         let (across, down) = (width / step, image.height() / step);
         if self.size() != (across, down) {
             self.least.resize(across, down, 0.0);
             self.most.resize(across, down, 0.0);
             self.rgb.resize(across, down, [0.0; 3]);
+            self.peak.resize(across, down, 0);
             self.valid.resize(across, down, 0);
         }
-        extremes.least.resize(pixels, 0);
-        extremes.most.resize(pixels, 0);
         let band = step * width;
-        let planes = extremes.least.par_chunks_mut(band).zip(extremes.most.par_chunks_mut(band));
-        let (whole, rest) = image.pixels().split_at(down * band);
         let cells = self.least.pixels_mut().par_chunks_mut(across);
         let cells = cells.zip(self.most.pixels_mut().par_chunks_mut(across));
         let cells = cells.zip(self.rgb.pixels_mut().par_chunks_mut(across));
+        let cells = cells.zip(self.peak.pixels_mut().par_chunks_mut(across));
         let cells = cells.zip(self.valid.pixels_mut().par_chunks_mut(across));
-        let rows = cells.zip(planes).zip(whole.par_chunks(band)).enumerate();
-        rows.for_each(|(row, (((((least, most), rgb), valid), extremes), source))| {
+        let rows = cells.zip(image.pixels().par_chunks(band)).enumerate();
+        rows.for_each(|(row, (((((least, most), rgb), peak), valid), source))| {
             wide::run(CellRow {
                 source,
                 width,
                 step,
-                extremes,
                 least,
                 most,
                 rgb,
+                peak,
             });
             for (valid, most) in valid.iter_mut().zip(most.iter()) {
                 *valid = if *most > MIN_MOST_LEVELS { 255 } else { 0 };
@@ -88,10 +80,16 @@ impl Cells {
                 }
             }
         });
-        let (least, most) = (&mut extremes.least[down * band..], &mut extremes.most[down * band..]);
-        for ((least, most), [r, g, b]) in least.iter_mut().zip(most).zip(rest) {
-            *least = *r.min(g).min(b);
-            *most = *r.max(g).max(b);
+        if width > across * step {
+            self.peak
+                .pixels_mut()
+                .iter_mut()
+                .skip(across - 1)
+                .step_by(across)
+                .for_each(|peak| *peak = 255);
+        }
+        if image.height() > down * step {
+            self.peak.row_mut(down - 1).fill(255);
         }
     }
 }
@@ -102,10 +100,10 @@ struct CellRow<'a> {
     source: &'a [Rgb8],
     width: usize,
     step: usize,
-    extremes: (&'a mut [u8], &'a mut [u8]),
     least: &'a mut [f32],
     most: &'a mut [f32],
     rgb: &'a mut [[f32; 3]],
+    peak: &'a mut [u8],
 }
 
 impl Kernel for CellRow<'_> {
@@ -115,17 +113,17 @@ impl Kernel for CellRow<'_> {
             source,
             width,
             step,
-            extremes,
             least,
             most,
             rgb,
+            peak,
         } = self;
-        let scale = 1.0 / (step * step) as f32;
         let chunk = CHUNK / step * step;
         for left in (0..width).step_by(chunk) {
             let n = chunk.min(width - left);
             // Sums down the columns, of: least, most, red, green, blue.
             let mut sums = [[0_u16; CHUNK]; 5];
+            let mut peaks = [0_u8; CHUNK];
             for v in 0..step {
                 let at = v * width + left;
                 let planes = match source[at..].first_chunk::<CHUNK>() {
@@ -142,30 +140,63 @@ impl Kernel for CellRow<'_> {
                         *sum = sum.wrapping_add(u16::from(*value));
                     }
                 }
-                for (plane, extreme) in planes.iter().zip([&mut *extremes.0, &mut *extremes.1]) {
-                    match extreme[at..].first_chunk_mut::<CHUNK>().filter(|_| n == CHUNK) {
-                        Some(extreme) => *extreme = *plane,
-                        None => extreme[at..at + n].copy_from_slice(&plane[..n]),
-                    }
+                for (peak, least) in peaks.iter_mut().zip(&planes[0]) {
+                    *peak = (*peak).max(*least);
                 }
             }
-            let first = left / step;
-            for (i, columns) in (0..n / step).map(|i| (first + i, i * step..(i + 1) * step)) {
-                let [a, b, c, d, e] = [0, 1, 2, 3, 4].map(|k| total(&sums[k][columns.clone()]) as f32 * scale);
-                least[i] = a;
-                most[i] = b;
-                rgb[i] = [c, d, e];
+            // The cells of a 1080p picture are of a size that the compiler knows.
+            let (first, cells) = (left / step, n / step);
+            let range = first..first + cells;
+            let found = Found {
+                least: &mut least[range.clone()],
+                most: &mut most[range.clone()],
+                rgb: &mut rgb[range.clone()],
+                peak: &mut peak[range],
+            };
+            if step == 8 {
+                finish::<8>(&sums, &peaks, step, found);
+            } else {
+                finish::<0>(&sums, &peaks, step, found);
             }
         }
     }
 }
 
+/// Of neighbouring cells.
+struct Found<'a> {
+    least: &'a mut [f32],
+    most: &'a mut [f32],
+    rgb: &'a mut [[f32; 3]],
+    peak: &'a mut [u8],
+}
+
+/// Means and peaks of cells from the sums and peaks of their columns; `STEP` is `step` or 0.
 #[inline(always)]
-fn total(sums: &[u16]) -> u32 {
-    match <&[u16; 8]>::try_from(sums) {
-        // The cells of a 1080p picture.
-        Ok(eight) => eight.iter().map(|v| u32::from(*v)).sum(),
-        Err(_) => sums.iter().map(|v| u32::from(*v)).sum(),
+fn finish<const STEP: usize>(sums: &[[u16; CHUNK]; 5], peaks: &[u8; CHUNK], step: usize, found: Found<'_>) {
+    let step = if STEP > 0 { STEP } else { step };
+    let scale = 1.0 / (step * step) as f32;
+    let mut means = [[0.0; CHUNK]; 5];
+    for (means, sums) in means.iter_mut().zip(sums) {
+        for (mean, sums) in means.iter_mut().zip(sums.chunks_exact(step)) {
+            let mut total = 0;
+            for sum in sums {
+                total += u32::from(*sum);
+            }
+            *mean = total as f32 * scale;
+        }
+    }
+    for (peak, peaks) in found.peak.iter_mut().zip(peaks.chunks_exact(step)) {
+        let mut highest = 0_u8;
+        for value in peaks {
+            highest = highest.max(*value);
+        }
+        *peak = highest;
+    }
+    let [least, most, red, green, blue] = &means;
+    for i in 0..found.least.len().min(CHUNK) {
+        found.least[i] = least[i];
+        found.most[i] = most[i];
+        found.rgb[i] = [red[i], green[i], blue[i]];
     }
 }
 
@@ -197,12 +228,8 @@ mod tests {
             let image = Image::from_vec(width, height, (0..width * height).map(|_| random.random()).collect()).unwrap();
             let mut field = Image::filled(width, height, 255);
             field.set(width / 2, height / 2, 0);
-            let (mut cells, mut extremes) = (Cells::new(), Extremes::default());
-            cells.average(&image, Some(&field), step, &mut extremes);
-            for (index, [r, g, b]) in image.pixels().iter().enumerate() {
-                let found = (extremes.least[index], extremes.most[index]);
-                assert_eq!(found, (*r.min(g).min(b), *r.max(g).max(b)));
-            }
+            let mut cells = Cells::new();
+            cells.average(&image, Some(&field), step);
             for y in 0..height / step {
                 for x in 0..width / step {
                     let places = || (y * step..(y + 1) * step).flat_map(|v| (x * step..(x + 1) * step).map(move |u| (u, v)));
@@ -217,6 +244,9 @@ mod tests {
                     same(r, |p| p[0]);
                     same(g, |p| p[1]);
                     same(b, |p| p[2]);
+                    let peak = places().map(|(u, v)| image.at(u, v).into_iter().fold(255, u8::min)).max();
+                    let beside_rest = (x + 2) * step > width && width % step > 0 || (y + 2) * step > height && height % step > 0;
+                    assert_eq!(Some(cells.peak.at(x, y)), if beside_rest { Some(255) } else { peak });
                     let inside = places().all(|(u, v)| field.at(u, v) != 0);
                     assert_eq!(cells.valid.at(x, y) != 0, inside && mean(|[r, g, b]| r.max(g).max(b)) > 12.0);
                 }

@@ -1,12 +1,14 @@
 //! The detector: all steps in order, and halos joined to their cores.
 
+use std::ops::Range;
+
 use crate::image::blur::BlurScratch;
 use crate::image::buffer::{Image, Mask, Rgb8};
-use crate::image::components::Components;
-use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
-use crate::image::specularity::background::Background;
-use crate::image::specularity::cells::{CHUNK, Cells, Extremes};
-use crate::image::specularity::classify::{Classifier, Rules};
+use crate::image::components::{Components, set_runs};
+use crate::image::distance::{UNITS_PER_PX, chamfer_distance_within};
+use crate::image::specularity::background::{Background, extreme_over_square};
+use crate::image::specularity::cells::{CHUNK, Cells};
+use crate::image::specularity::classify::{Classifier, Demand};
 use crate::image::specularity::settings::{CELLS_ACROSS, REFERENCE_WIDTH_PX, Settings};
 use crate::image::specularity::steel::Steel;
 
@@ -22,15 +24,22 @@ const MIN_CORE_PX: u32 = 2;
 pub struct SpecularityDetector {
     settings: Settings,
     cells: Cells,
-    extremes: Extremes,
     steel: Steel,
     background: Background,
     classifier: Classifier,
+    /// Cells in which there may be cores, near to cores, and of these the ones in which there may be halos.
+    core_cells: Mask,
+    near_cells: Mask,
+    halo_cells: Mask,
+    cell_rows: Mask,
+    /// 255 on cores; 0 outside `core_cells`.
     cores: Mask,
+    /// 255 on halos; 0 outside `halo_cells`.
     halos: Mask,
+    /// From the nearest core; beyond every limit outside `near_cells`.
     distance: Image<u16>,
     components: Components,
-    /// Per region: core pixels, nearly clipped pixels.
+    /// Per region: core pixels, as far as they decide, and in large ones nearly clipped pixels.
     counts: Vec<[u32; 2]>,
     scratch: BlurScratch,
 }
@@ -41,10 +50,13 @@ impl SpecularityDetector {
         Self {
             settings: settings.clone(),
             cells: Cells::new(),
-            extremes: Extremes::default(),
             steel: Steel::new(),
             background: Background::new(),
-            classifier: Classifier::default(),
+            classifier: Classifier::new(),
+            core_cells: Image::filled(0, 0, 0),
+            near_cells: Image::filled(0, 0, 0),
+            halo_cells: Image::filled(0, 0, 0),
+            cell_rows: Image::filled(0, 0, 0),
             cores: Image::filled(0, 0, 0),
             halos: Image::filled(0, 0, 0),
             distance: Image::filled(0, 0, 0),
@@ -57,65 +69,132 @@ impl SpecularityDetector {
     /// Find specularities (255 in `specular`) and steel (255 in `instruments`) of `image` inside `field` (all of it if `None`).
     /// Both masks get the size of the picture.
     pub fn detect(&mut self, image: &Image<Rgb8>, field: Option<&Mask>, specular: &mut Mask, instruments: &mut Mask) {
-        for mask in [&mut *specular, &mut *instruments, &mut self.cores, &mut self.halos] {
+        for mask in [&mut *specular, &mut *instruments] {
             if mask.size() != image.size() {
                 mask.resize(image.width(), image.height(), 0);
             }
         }
         specular.fill(0);
         let step = (image.width() / CELLS_ACROSS).max(1);
+        self.forget(image.size(), step);
         if image.width() < 2 * step || image.height() < 2 * step || step > CHUNK {
             instruments.fill(0);
             return;
         }
-        self.cells.average(image, field, step, &mut self.extremes);
+        self.cells.average(image, field, step);
         let brightness = brightness_of(&self.cells);
         self.steel.find(&self.settings, &self.cells, brightness, &mut self.scratch);
         self.background
             .find(&self.settings, &self.cells, &self.steel.mask, brightness, &mut self.scratch);
-        let rules = Rules {
-            bounds: &self.background.bounds,
-            steel: &self.steel.mask,
-            field,
-            step,
-            whiteness: self.settings.whiteness,
-            core_whiteness: self.settings.core_whiteness,
+        let (bounds, steel) = (&self.background.bounds, &self.steel.mask);
+        let core = Demand {
+            level: &bounds.core,
+            white: &bounds.core_white,
+            whiteness: self.settings.core_whiteness,
         };
+        let halo = Demand {
+            level: &bounds.halo,
+            white: &bounds.white,
+            whiteness: self.settings.whiteness,
+        };
+        let picture = (image, field);
+        self.classifier.candidates(&core, &self.cells, steel, &mut self.core_cells);
         self.classifier
-            .classify(&self.extremes, &rules, &mut self.cores, &mut self.halos);
-        self.join_halos_to_cores(specular);
+            .classify(picture, &core, (&self.core_cells, step), &mut self.cores);
+        let reach = (self.settings.halo_reach_px * image.width() as f32 / REFERENCE_WIDTH_PX).max(3.0);
+        let limit = (reach * f32::from(UNITS_PER_PX)) as u16;
+        find_near_cells((&self.cores, &self.core_cells, step), &mut self.near_cells);
+        let reach_cells = usize::from(limit / UNITS_PER_PX) / step + 1;
+        extreme_over_square(&mut self.near_cells, reach_cells, u8::max, 0, &mut self.cell_rows);
+        self.classifier.candidates(&halo, &self.cells, steel, &mut self.halo_cells);
+        for (cell, near) in self.halo_cells.pixels_mut().iter_mut().zip(self.near_cells.pixels()) {
+            *cell &= near;
+        }
+        self.classifier
+            .classify(picture, &halo, (&self.halo_cells, step), &mut self.halos);
+        self.join_halos_to_cores(image, step, limit, specular);
         enlarge(&self.steel.mask, step, instruments);
     }
 
-    /// Paint what touches a core into `specular`.
-    fn join_halos_to_cores(&mut self, specular: &mut Mask) {
-        let (width, height) = specular.size();
-        let reach = (self.settings.halo_reach_px * width as f32 / REFERENCE_WIDTH_PX).max(3.0);
-        let limit = (reach * f32::from(UNITS_PER_PX)) as u16;
-        chamfer_distance(&self.cores, limit + 1, &mut self.distance);
-        for (halo, &distance) in self.halos.pixels_mut().iter_mut().zip(self.distance.pixels()) {
-            *halo = if distance <= limit { *halo } else { 0 };
+    /// Cores, halos and distances of the last picture away, so that what holds outside their cells holds everywhere.
+    fn forget(&mut self, size: (usize, usize), step: usize) {
+        if self.cores.size() == size {
+            each_stretch(&self.core_cells, step, &mut self.cores, |_, cores| cores.fill(0));
+            each_stretch(&self.halo_cells, step, &mut self.halos, |_, halos| halos.fill(0));
+            each_stretch(&self.near_cells, step, &mut self.distance, |_, distance| {
+                distance.fill(u16::MAX)
+            });
+        } else {
+            self.cores = Image::filled(size.0, size.1, 0);
+            self.halos = Image::filled(size.0, size.1, 0);
+            self.distance = Image::filled(size.0, size.1, u16::MAX);
         }
+        for cells in [&mut self.core_cells, &mut self.halo_cells, &mut self.near_cells] {
+            cells.fill(0);
+        }
+    }
+
+    /// Paint what touches a core into `specular`.
+    fn join_halos_to_cores(&mut self, image: &Image<Rgb8>, step: usize, limit: u16, specular: &mut Mask) {
+        let (width, height) = specular.size();
+        chamfer_distance_within((&self.near_cells, step), &self.cores, limit + 1, &mut self.distance);
+        let distance = &self.distance;
+        each_stretch(&self.halo_cells, step, &mut self.halos, |pixels, halos| {
+            for (halo, &distance) in halos.iter_mut().zip(&distance.pixels()[pixels]) {
+                *halo = if distance <= limit { *halo } else { 0 };
+            }
+        });
         self.components.label(&self.halos);
         self.counts.clear();
         self.counts.resize(self.components.regions().len(), [0, 0]);
+        let max_area = self.settings.max_region_share * (width * height) as f32;
+        let is_large = |label: usize| self.components.regions()[label].area as f32 > max_area;
         for run in self.components.runs() {
             let first = run.y as usize * width;
             let pixels = first + run.begin as usize..first + run.end as usize;
-            let cores = self.cores.pixels()[pixels.clone()].iter().filter(|core| **core != 0);
-            let clipped = self.extremes.least[pixels]
-                .iter()
-                .filter(|least| **least >= NEARLY_CLIPPED_LEVEL);
-            let count = &mut self.counts[run.label as usize];
-            *count = [count[0] + cores.count() as u32, count[1] + clipped.count() as u32];
+            let [cores, clipped] = &mut self.counts[run.label as usize];
+            if *cores < MIN_CORE_PX {
+                *cores += self.cores.pixels()[pixels.clone()].iter().filter(|core| **core != 0).count() as u32;
+            }
+            if is_large(run.label as usize) {
+                let is_clipped = |color: &&Rgb8| color.iter().all(|level| *level >= NEARLY_CLIPPED_LEVEL);
+                *clipped += image.pixels()[pixels].iter().filter(is_clipped).count() as u32;
+            }
         }
-        let max_area = self.settings.max_region_share * (width * height) as f32;
         let counts = &self.counts;
         self.components.paint(specular, 255, |label, region| {
             let [cores, clipped] = counts[label];
-            let plausible = region.area as f32 <= max_area || clipped as f32 > MIN_CLIPPED_SHARE * region.area as f32;
+            let plausible = !is_large(label) || clipped as f32 > MIN_CLIPPED_SHARE * region.area as f32;
             cores >= MIN_CORE_PX && plausible
         });
+    }
+}
+
+/// 255 in `near` for each of the `core_cells`, of `step` px, that has a core.
+fn find_near_cells((cores, core_cells, step): (&Mask, &Mask, usize), near: &mut Mask) {
+    near.copy_from(core_cells);
+    near.fill(0);
+    let (width, last_row) = (cores.width(), near.height() - 1);
+    for y in 0..cores.height() {
+        let row = (y / step).min(last_row);
+        let near = near.row_mut(row);
+        for cell in set_runs(core_cells.row(row)).flatten() {
+            let end = if cell + 1 == near.len() { width } else { (cell + 1) * step };
+            near[cell] |= cores.row(y)[cell * step..end].iter().fold(0, |any, core| any | core);
+        }
+    }
+}
+
+/// Do something with each stretch of pixels, named by its place in the image, that the set cells of `step` px cover.
+fn each_stretch<P: Copy>(cells: &Mask, step: usize, image: &mut Image<P>, mut work: impl FnMut(Range<usize>, &mut [P])) {
+    let (width, height) = image.size();
+    for y in 0..height {
+        let row = (y / step).min(cells.height().saturating_sub(1));
+        for run in set_runs(cells.row(row)) {
+            let end = if run.end == cells.width() { width } else { run.end * step };
+            let pixels = y * width + run.start * step..y * width + end;
+            work(pixels.clone(), &mut image.pixels_mut()[pixels]);
+        }
     }
 }
 
@@ -142,19 +221,18 @@ fn brightness_of(cells: &Cells) -> f32 {
     1.0
 }
 
-/// Enlarge a mask by an integer factor; a remainder at the right and bottom repeats the last cell.
+/// Enlarge a mask of 0 and 255 by an integer factor; a remainder at the right and bottom repeats the last cell.
 fn enlarge(small: &Mask, step: usize, out: &mut Mask) {
     let (small_width, small_height) = small.size();
     let (width, height) = out.size();
     for row in 0..small_height {
         let (first, end) = (row * step, if row + 1 == small_height { height } else { (row + 1) * step });
-        let line = out.row_mut(first);
-        for (cell, &value) in small.row(row).iter().enumerate() {
-            let end = if cell + 1 == small_width { width } else { (cell + 1) * step };
-            line[cell * step..end].fill(value);
-        }
-        for y in first + 1..end {
-            out.pixels_mut().copy_within(first * width..(first + 1) * width, y * width);
+        out.pixels_mut()[first * width..end * width].fill(0);
+        for run in set_runs(small.row(row)) {
+            let columns = run.start * step..if run.end == small_width { width } else { run.end * step };
+            for y in first..end {
+                out.row_mut(y)[columns.clone()].fill(255);
+            }
         }
     }
 }

@@ -12,8 +12,9 @@
 //!
 //! All lengths below are given for a picture 960 px wide and scale with the width.
 //!
-//! The order of work: `cells` averages the picture over cells, `steel` and `background` look at the cells alone, `classify` holds every
-//! pixel against bounds that are interpolated between cells, `detector` does it all and joins halos to cores.
+//! The order of work: `cells` averages the picture over cells, `steel` and `background` look at the cells alone, `classify` holds the
+//! pixels of cells that are bright enough against bounds that are interpolated between cells, `detector` does it all and joins halos to
+//! cores.
 
 mod background;
 mod cells;

@@ -6,7 +6,7 @@ use rayon::slice::ParallelSliceMut as _;
 use crate::frame::Frame;
 use crate::image::wide;
 use crate::stages::temporal_median::history::History;
-use crate::stages::temporal_median::motion::{self, BLOCK, BlockRow, BlockStats, LAGS, Motion};
+use crate::stages::temporal_median::motion::{self, BLOCK, BlockRow, BlockStats, LAGS, Motion, Share};
 use crate::stages::temporal_median::noise::Noise;
 
 /// Distance at which the arm's speed is turned into picture speed when nobody knows the depth, mm.
@@ -25,6 +25,7 @@ pub struct Guard {
     pub motions: Vec<Motion>,
     /// Learnt over the frames.
     pub noise: Noise,
+    shares: Vec<Share>,
 }
 
 impl Guard {
@@ -56,7 +57,7 @@ impl Guard {
             });
         });
         self.noise.learn(&self.stats);
-        motion::classify(&self.stats, columns, &self.noise, &mut self.motions);
+        motion::classify(&self.stats, columns, &self.noise, &mut self.shares, &mut self.motions);
     }
 }
 

@@ -158,19 +158,37 @@ fn texture(gray: &[u8], width: usize, left: usize, columns: usize, stats: &mut B
     stats.texture = central as f32 / inner / 2.0;
 }
 
-/// Judge every block; `columns` blocks a row.
-pub fn classify(stats: &[BlockStats], columns: usize, noise: &Noise, motions: &mut [Motion]) {
+/// What a block adds to the sums over its surroundings, per lag: squares, inliers, and the squares that noise would give.
+pub type Share = [[f32; 3]; LAGS];
+
+/// Judge every block; `columns` blocks a row. `shares` is working memory.
+pub fn classify(stats: &[BlockStats], columns: usize, noise: &Noise, shares: &mut Vec<Share>, motions: &mut [Motion]) {
     let rows = stats.len() / columns.max(1);
     let noise = noise.table();
+    shares.clear();
+    shares.extend(stats.iter().map(|block| -> Share {
+        let variance = noise.variance_at(block.level);
+        std::array::from_fn(|lag| {
+            let inliers = block.inliers[lag] as f32;
+            [block.squares[lag] as f32, inliers, inliers * 2.0 * variance]
+        })
+    }));
     for y in 0..rows {
         for x in 0..columns {
-            motions[y * columns + x] = judge(stats, columns, rows, (x, y), &noise);
+            let mut around = Share::default();
+            for ny in y.saturating_sub(1)..(y + 2).min(rows) {
+                for near in &shares[ny * columns + x.saturating_sub(1)..ny * columns + (x + 2).min(columns)] {
+                    for (sum, share) in around.as_flattened_mut().iter_mut().zip(near.as_flattened()) {
+                        *sum += share;
+                    }
+                }
+            }
+            motions[y * columns + x] = judge(&stats[y * columns + x], &around, &noise);
         }
     }
 }
 
-fn judge(stats: &[BlockStats], columns: usize, rows: usize, (x, y): (usize, usize), noise: &NoiseTable) -> Motion {
-    let block = &stats[y * columns + x];
+fn judge(block: &BlockStats, sums_around: &Share, noise: &NoiseTable) -> Motion {
     let pair_variance = 2.0 * noise.variance_at(block.level);
     let mut still = true;
     let mut strongest = 0.0_f32;
@@ -184,15 +202,7 @@ fn judge(stats: &[BlockStats], columns: usize, rows: usize, (x, y): (usize, usiz
             still &= bias <= STILL_LEVELS + STILL_SIGMAS * (pair_variance / n as f32).sqrt();
             strongest = strongest.max((mean_square - SLACK) / pair_variance);
         }
-        let (mut squares, mut inliers, mut expected) = (0.0_f32, 0.0_f32, 0.0_f32);
-        for ny in y.saturating_sub(1)..(y + 2).min(rows) {
-            for nx in x.saturating_sub(1)..(x + 2).min(columns) {
-                let near = &stats[ny * columns + nx];
-                squares += near.squares[lag] as f32;
-                inliers += near.inliers[lag] as f32;
-                expected += near.inliers[lag] as f32 * 2.0 * noise.variance_at(near.level);
-            }
-        }
+        let [squares, inliers, expected] = sums_around[lag];
         if inliers >= MIN_INLIERS as f32 {
             still &= squares <= STILL_RATIO_AROUND * expected + SLACK * inliers;
             *around = squares / inliers;

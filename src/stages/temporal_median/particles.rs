@@ -34,6 +34,24 @@ const SEEN: u8 = 1;
 const TAKE_MEDIAN: u8 = 2;
 const KEEP_NEWEST: u8 = 4;
 
+/// Which of the two pictures is right.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Side {
+    /// The frame as it came.
+    Newest,
+    /// The median.
+    Median,
+}
+
+/// What was found about a block.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Verdict {
+    /// One side is right everywhere.
+    All(Side),
+    /// The marks tell; where there are none, the median if it rules.
+    ByMark { median_rules: bool },
+}
+
 #[derive(Clone, Copy, Debug)]
 struct Blob {
     first: usize,
@@ -49,6 +67,7 @@ struct Blob {
 /// The judge and its buffers.
 #[derive(Debug, Default)]
 pub struct Particles {
+    size: (usize, usize),
     marks: Vec<u8>,
     stack: Vec<u32>,
     members: Vec<u32>,
@@ -61,12 +80,12 @@ pub struct Particles {
 /// What the judge looks at.
 #[derive(Debug)]
 pub struct Evidence<'a> {
-    /// The frame as it came.
-    pub newest: &'a Image<Rgb8>,
     /// Gray of the newest frame.
     pub gray: &'a [u8],
-    /// 255 where newest and median depart from each other.
+    /// 255 where newest and median depart from each other; 0 in moving blocks.
     pub departs: &'a [u8],
+    /// Per block: whether it has such a pixel.
+    pub departing: &'a [bool],
     /// Per block.
     pub stats: &'a [BlockStats],
     /// Per block.
@@ -84,11 +103,11 @@ fn gray(color: Rgb8) -> i32 {
 }
 
 impl Particles {
-    /// Make `median` the result: newest where the guard says so, median elsewhere.
-    pub fn settle(&mut self, evidence: &Evidence<'_>, median: &mut Image<Rgb8>) {
-        let (width, height) = evidence.newest.size();
+    /// Judge what departs; `median` may hold anything in moving blocks.
+    pub fn settle(&mut self, evidence: &Evidence<'_>, median: &Image<Rgb8>) {
+        let (width, height) = median.size();
         let columns = width.div_ceil(BLOCK);
-        self.prepare(width * height, evidence.motions.len());
+        self.prepare((width, height), evidence.motions.len());
         self.find_blobs(evidence, median);
         self.suspect_blocks(columns, evidence);
         for index in 0..self.blobs.len() {
@@ -101,19 +120,25 @@ impl Particles {
             for member in blob.first..blob.first + blob.count {
                 let at = self.members[member] as usize;
                 let (x, y) = (at % width, at / width);
-                for ny in y.saturating_sub(GROW)..(y + GROW + 1).min(height) {
-                    for nx in x.saturating_sub(GROW)..(x + GROW + 1).min(width) {
-                        self.marks[ny * width + nx] |= mark;
-                        self.busy[ny / BLOCK * columns + nx / BLOCK] = true;
+                let (left, right) = (x.saturating_sub(GROW), (x + GROW).min(width - 1));
+                let (top, bottom) = (y.saturating_sub(GROW), (y + GROW).min(height - 1));
+                for row in top..=bottom {
+                    for near in &mut self.marks[row * width + left..=row * width + right] {
+                        *near |= mark;
                     }
+                }
+                for row in [top / BLOCK, bottom / BLOCK] {
+                    self.busy[row * columns + left / BLOCK] = true;
+                    self.busy[row * columns + right / BLOCK] = true;
                 }
             }
         }
-        self.write(evidence, median);
     }
 
-    fn prepare(&mut self, pixels: usize, blocks: usize) {
-        if self.marks.len() != pixels {
+    fn prepare(&mut self, (width, height): (usize, usize), blocks: usize) {
+        let pixels = width * height;
+        if self.size != (width, height) {
+            self.size = (width, height);
             self.marks = vec![0; pixels];
             self.stack = Vec::with_capacity(pixels);
             self.members = Vec::with_capacity(pixels);
@@ -121,7 +146,20 @@ impl Particles {
             self.suspect = vec![0; blocks];
             self.busy = vec![false; blocks];
         }
-        self.marks.fill(0);
+        // All marks of the last frame lie in its busy blocks.
+        let columns = width.div_ceil(BLOCK);
+        for (block, _) in self.busy.iter().enumerate().filter(|(_, busy)| **busy) {
+            let (left, top) = (block % columns * BLOCK, block / columns * BLOCK);
+            for y in top..(top + BLOCK).min(height) {
+                match self.marks[y * width + left..]
+                    .first_chunk_mut::<BLOCK>()
+                    .filter(|_| left + BLOCK <= width)
+                {
+                    Some(marks) => *marks = [0; BLOCK],
+                    None => self.marks[y * width + left..(y + 1) * width].fill(0),
+                }
+            }
+        }
         self.suspect.fill(0);
         self.busy.fill(false);
         self.members.clear();
@@ -129,13 +167,10 @@ impl Particles {
     }
 
     fn find_blobs(&mut self, evidence: &Evidence<'_>, median: &Image<Rgb8>) {
-        let (width, height) = evidence.newest.size();
+        let (width, height) = median.size();
         let columns = width.div_ceil(BLOCK);
-        for (by, motions) in evidence.motions.chunks_exact(columns).enumerate() {
-            for (bx, motion) in motions.iter().enumerate() {
-                if *motion == Motion::Moving {
-                    continue;
-                }
+        for (by, departing) in evidence.departing.chunks_exact(columns).enumerate() {
+            for (bx, _) in departing.iter().enumerate().filter(|(_, departing)| **departing) {
                 let (left, right) = (bx * BLOCK, (bx * BLOCK + BLOCK).min(width));
                 for y in by * BLOCK..(by * BLOCK + BLOCK).min(height) {
                     let row = &evidence.departs[y * width + left..y * width + right];
@@ -154,7 +189,8 @@ impl Particles {
     }
 
     fn flood(&mut self, seed: usize, evidence: &Evidence<'_>, median: &Image<Rgb8>) {
-        let (width, height) = evidence.newest.size();
+        let (width, height) = median.size();
+        let columns = width.div_ceil(BLOCK);
         let departs = evidence.departs;
         let first = self.members.len();
         let (x, y) = (seed % width, seed / width);
@@ -196,7 +232,12 @@ impl Particles {
             for outside in across.into_iter().flatten() {
                 if departs[outside] == 0 {
                     let newest = evidence.gray[at].abs_diff(evidence.gray[outside]);
-                    let (m, n) = (gray(median.pixels()[at]), gray(median.pixels()[outside]));
+                    let block = outside / width / BLOCK * columns + outside % width / BLOCK;
+                    let n = match evidence.motions[block] {
+                        Motion::Moving => i32::from(evidence.gray[outside]),
+                        _ => gray(median.pixels()[outside]),
+                    };
+                    let m = gray(median.pixels()[at]);
                     blob.contrast_newest += u32::from(newest);
                     blob.contrast_median += m.abs_diff(n);
                 }
@@ -256,36 +297,54 @@ impl Particles {
         (blob.contrast_median as f32) < limit * blob.contrast_newest as f32
     }
 
-    fn write(&self, evidence: &Evidence<'_>, median: &mut Image<Rgb8>) {
-        let (width, height) = evidence.newest.size();
+    /// Copy the pixels for which `side` is right from its picture to the other's; the rest of `to` stays.
+    pub fn copy(&self, evidence: &Evidence<'_>, side: Side, from: &Image<Rgb8>, to: &mut Image<Rgb8>) {
+        let (width, height) = to.size();
         let columns = width.div_ceil(BLOCK);
-        for (block, motion) in evidence.motions.iter().enumerate() {
-            // Moving blocks hold the newest frame already.
-            let median_rules = *motion == Motion::Still && !evidence.particles_only;
-            if *motion == Motion::Moving || (median_rules && !self.busy[block]) {
-                continue;
-            }
-            let (left, top) = (block % columns * BLOCK, block / columns * BLOCK);
-            let right = (left + BLOCK).min(width);
-            for y in top..(top + BLOCK).min(height) {
-                let newest = &evidence.newest.row(y)[left..right];
-                let target = &mut median.row_mut(y)[left..right];
-                if !self.busy[block] {
-                    target.copy_from_slice(newest);
-                    continue;
-                }
-                let marks = &self.marks[y * width + left..y * width + right];
-                for ((target, newest), mark) in target.iter_mut().zip(newest).zip(marks) {
-                    let keep = if median_rules {
-                        mark & (KEEP_NEWEST | TAKE_MEDIAN) == KEEP_NEWEST
-                    } else {
-                        mark & TAKE_MEDIAN == 0
-                    };
-                    if keep {
-                        *target = *newest;
+        for (by, motions) in evidence.motions.chunks_exact(columns).enumerate() {
+            let busy = &self.busy[by * columns..(by + 1) * columns];
+            let rows = by * BLOCK..(by * BLOCK + BLOCK).min(height);
+            let verdict = |bx: usize| self.verdict(evidence, motions[bx], busy[bx]);
+            let mut first = 0;
+            while first < columns {
+                let alike = (first..columns).take_while(|bx| verdict(*bx) == verdict(first)).count();
+                let (left, right) = (first * BLOCK, ((first + alike) * BLOCK).min(width));
+                match verdict(first) {
+                    Verdict::All(right_side) if right_side == side => {
+                        for y in rows.clone() {
+                            to.row_mut(y)[left..right].copy_from_slice(&from.row(y)[left..right]);
+                        }
+                    }
+                    Verdict::All(_) => {}
+                    Verdict::ByMark { median_rules } => {
+                        for y in rows.clone() {
+                            let marks = &self.marks[y * width + left..y * width + right];
+                            let pixels = to.row_mut(y)[left..right].iter_mut().zip(&from.row(y)[left..right]);
+                            for ((to, from), mark) in pixels.zip(marks) {
+                                let newest = if median_rules {
+                                    mark & (KEEP_NEWEST | TAKE_MEDIAN) == KEEP_NEWEST
+                                } else {
+                                    mark & TAKE_MEDIAN == 0
+                                };
+                                if newest == (side == Side::Newest) {
+                                    *to = *from;
+                                }
+                            }
+                        }
                     }
                 }
+                first += alike;
             }
+        }
+    }
+
+    fn verdict(&self, evidence: &Evidence<'_>, motion: Motion, busy: bool) -> Verdict {
+        let median_rules = motion == Motion::Still && !evidence.particles_only;
+        match (motion, busy) {
+            (Motion::Moving, _) => Verdict::All(Side::Newest),
+            (_, true) => Verdict::ByMark { median_rules },
+            (_, false) if median_rules => Verdict::All(Side::Median),
+            (_, false) => Verdict::All(Side::Newest),
         }
     }
 }

@@ -11,7 +11,7 @@ use crate::stages::scene_cut::SceneCut;
 use crate::stages::temporal_median::guard::{self, Guard};
 use crate::stages::temporal_median::history::History;
 use crate::stages::temporal_median::motion::{BLOCK, Motion};
-use crate::stages::temporal_median::particles::{Evidence, Particles};
+use crate::stages::temporal_median::particles::{Evidence, Particles, Side};
 use crate::stages::temporal_median::settings::{Settings, SettingsError};
 use crate::stages::temporal_median::vector_median::{Colors, Run, Wide};
 
@@ -33,7 +33,10 @@ pub struct TemporalMedian {
     particles: Particles,
     scene_cut: SceneCut,
     output: Image<Rgb8>,
+    /// 255 where the newest frame departs from the median; 0 in moving blocks.
     departs: Vec<u8>,
+    /// Per block: whether some pixel departs.
+    departing: Vec<bool>,
     period_ms: Option<f64>,
     last_id: Option<FrameId>,
 }
@@ -50,6 +53,7 @@ impl TemporalMedian {
             scene_cut: SceneCut::default(),
             output: Image::filled(0, 0, [0; 3]),
             departs: Vec::new(),
+            departing: Vec::new(),
             period_ms: None,
             last_id: None,
         })
@@ -89,11 +93,11 @@ impl TemporalMedian {
         if held == 2 { 3 } else { wanted.min(held_odd) }
     }
 
-    fn median<const N: usize>(&mut self, newest: &Image<Rgb8>, threshold: u8)
+    /// Fill `output`, `departs` and `departing` in the blocks that do not move.
+    fn median<const N: usize>(&mut self, (width, height): (usize, usize), threshold: u8)
     where
         [Wide; N]: Colors<N>,
     {
-        let (width, height) = newest.size();
         let columns = width.div_ceil(BLOCK);
         let oldest = self.history.count().saturating_sub(1);
         let window = std::array::from_fn(|age| self.history.planes(age.min(oldest)));
@@ -103,8 +107,9 @@ impl TemporalMedian {
             .pixels_mut()
             .par_chunks_mut(BLOCK * width)
             .zip(self.departs[..width * height].par_chunks_mut(BLOCK * width))
+            .zip(self.departing.par_chunks_mut(columns))
             .enumerate()
-            .for_each(|(band, (output, departs))| {
+            .for_each(|(band, ((output, departs), departing))| {
                 let motions = &motions[band * columns..(band + 1) * columns];
                 let top = band * BLOCK;
                 let rows = output.chunks_exact_mut(width).zip(departs.chunks_exact_mut(width));
@@ -112,11 +117,7 @@ impl TemporalMedian {
                     let mut block = 0;
                     for run in motions.chunk_by(|a, b| (*a == Motion::Moving) == (*b == Motion::Moving)) {
                         let (left, right) = (block * BLOCK, ((block + run.len()) * BLOCK).min(width));
-                        block += run.len();
-                        if run[0] == Motion::Moving {
-                            output[left..right].copy_from_slice(&newest.row(top + y)[left..right]);
-                            departs[left..right].fill(0);
-                        } else {
+                        if run[0] != Motion::Moving {
                             wide::run(Run::<N> {
                                 window,
                                 start: (top + y) * width + left,
@@ -126,7 +127,16 @@ impl TemporalMedian {
                                 method,
                                 distance,
                             });
+                        } else if departing[block..block + run.len()].contains(&true) {
+                            departs[left..right].fill(0);
                         }
+                        block += run.len();
+                    }
+                }
+                departing.fill(false);
+                for departs in departs.chunks_exact(width) {
+                    for ((departing, departs), motion) in departing.iter_mut().zip(departs.chunks(BLOCK)).zip(motions) {
+                        *departing |= *motion != Motion::Moving && departs.iter().fold(0, |any, departs| any | departs) != 0;
                     }
                 }
             });
@@ -157,6 +167,7 @@ impl Stage for TemporalMedian {
         if self.output.size() != size {
             self.output.resize(size.0, size.1, [0; 3]);
             self.departs = vec![0; size.0 * size.1];
+            self.departing = vec![false; size.0.div_ceil(BLOCK) * size.1.div_ceil(BLOCK)];
         }
         self.guard.judge(&self.history, window, size);
         if !self.settings.motion_guard {
@@ -168,25 +179,34 @@ impl Stage for TemporalMedian {
         let threshold = (self.settings.min_particle_levels as f32).max(DEPARTURE_SIGMAS * sigma);
         let threshold = (caution * threshold).min(120.0) as u8;
         match window {
-            3 => self.median::<3>(&frame.image, threshold),
-            5 => self.median::<5>(&frame.image, threshold),
-            _ => self.median::<7>(&frame.image, threshold),
+            3 => self.median::<3>(size, threshold),
+            5 => self.median::<5>(size, threshold),
+            _ => self.median::<7>(size, threshold),
         }
-        if self.settings.motion_guard {
-            let max_extent_px = (self.settings.max_particle_share * size.1 as f64).max(20.0) as usize;
-            let evidence = Evidence {
-                newest: &frame.image,
-                gray: &self.history.planes(0).gray,
-                departs: &self.departs,
-                stats: &self.guard.stats,
-                motions: &self.guard.motions,
-                noise: &self.guard.noise,
-                max_extent_px,
-                particles_only: two_frames,
-            };
-            self.particles.settle(&evidence, &mut self.output);
+        if !self.settings.motion_guard {
+            frame.image.swap(&mut self.output);
+            return Ok(());
         }
-        frame.image.swap(&mut self.output);
+        let max_extent_px = (self.settings.max_particle_share * size.1 as f64).max(20.0) as usize;
+        let evidence = Evidence {
+            gray: &self.history.planes(0).gray,
+            departs: &self.departs,
+            departing: &self.departing,
+            stats: &self.guard.stats,
+            motions: &self.guard.motions,
+            noise: &self.guard.noise,
+            max_extent_px,
+            particles_only: two_frames,
+        };
+        self.particles.settle(&evidence, &self.output);
+        // The smaller part is copied over to the larger.
+        let still = self.guard.motions.iter().filter(|motion| **motion == Motion::Still).count();
+        if 2 * still > self.guard.motions.len() && !two_frames {
+            self.particles.copy(&evidence, Side::Newest, &frame.image, &mut self.output);
+            frame.image.swap(&mut self.output);
+        } else {
+            self.particles.copy(&evidence, Side::Median, &self.output, &mut frame.image);
+        }
         Ok(())
     }
 
