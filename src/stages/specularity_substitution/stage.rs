@@ -20,7 +20,8 @@ use crate::stages::specularity_substitution::camera_blending::CameraBlending;
 use crate::stages::specularity_substitution::drawing::Chosen;
 use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::live::Live;
-use crate::stages::specularity_substitution::replacement::{Planes, replace};
+use crate::stages::specularity_substitution::reduced::{Reduced, mean_of_squares, reduced_camera, reduction_for};
+use crate::stages::specularity_substitution::replacement::{Decision, Planes, decide, replace};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 use crate::stages::specularity_substitution::sight::{Vantage, Views};
@@ -37,6 +38,27 @@ fn depth_step(width: usize) -> usize {
     width.div_ceil(DEPTH_WIDTH_PX).max(1)
 }
 
+/// The picture's camera, and what is made of it.
+#[derive(Debug)]
+struct Cameras {
+    of_picture: CameraModel,
+    /// Of the reduced picture.
+    reduced: CameraModel,
+    /// Of the depth's picture.
+    of_depth: CameraModel,
+}
+
+impl Cameras {
+    fn new(camera: &CameraModel, step: usize) -> Self {
+        let reduced = reduced_camera(camera, step);
+        Self {
+            of_picture: camera.clone(),
+            of_depth: reduced.scaled(1.0 / depth_step(reduced.width) as f64),
+            reduced,
+        }
+    }
+}
+
 /// Replaces specularities by what other views saw; without a light field it only says what it left.
 #[derive(Debug)]
 pub struct SpecularitySubstitution {
@@ -47,7 +69,8 @@ pub struct SpecularitySubstitution {
     filler: HoleFiller,
     support: Support,
     depth: Image<f32>,
-    coarse_camera: Option<CameraModel>,
+    cameras: Option<Cameras>,
+    reduced: Reduced,
     distance: Image<u16>,
     forbidden: Mask,
     vantages: Vec<Option<Vantage>>,
@@ -57,6 +80,7 @@ pub struct SpecularitySubstitution {
     fits: Vec<ViewFit>,
     benches: ArrayQueue<Workbench>,
     canvas: Canvas,
+    shares: Image<u8>,
     out: Image<Rgb8>,
     codes: Pool<u8>,
     views: Pool<u16>,
@@ -77,7 +101,8 @@ impl SpecularitySubstitution {
             filler: HoleFiller::default(),
             support: Support::default(),
             depth: Image::filled(0, 0, 0.0),
-            coarse_camera: None,
+            cameras: None,
+            reduced: Reduced::default(),
             distance: Image::filled(0, 0, 0),
             forbidden: Image::filled(0, 0, 0),
             vantages: Vec::new(),
@@ -86,19 +111,18 @@ impl SpecularitySubstitution {
             fits,
             benches: ArrayQueue::new(64),
             canvas: Canvas::default(),
+            shares: Image::filled(0, 0, 0),
             out: Image::filled(0, 0, [0; 3]),
             codes: Pool::new(64),
             views: Pool::new(32),
         }
     }
 
-    fn draw_depth(&mut self, light_field: &LightField, frame: &Frame, camera: &CameraModel) {
-        let Some(pose) = &frame.world_from_camera else { return };
-        let step = depth_step(camera.width);
-        let coarse = self.coarse_camera.get_or_insert_with(|| camera.scaled(1.0 / step as f64));
-        if coarse.width != camera.width / step {
-            *coarse = camera.scaled(1.0 / step as f64);
-        }
+    fn draw_depth(&mut self, light_field: &LightField, frame: &Frame) {
+        let (Some(pose), Some(cameras)) = (&frame.world_from_camera, &self.cameras) else {
+            return;
+        };
+        let coarse = &cameras.of_depth;
         self.rasterizer.render(&light_field.surface, coarse, pose, &mut self.depth);
         // The survey's stereo is blind under its own specularities: there the surface is taken to go on smoothly. Only the place is
         // guessed so, not the colour, and a wrong place shows on the ring.
@@ -125,25 +149,46 @@ impl SpecularitySubstitution {
     }
 
     fn substitute(&mut self, frame: &mut Frame, specular: &Mask, light_field: &LightField, camera: &CameraModel) {
-        let scale = specular.width() as f32 / REFERENCE_WIDTH_PX;
+        let step = reduction_for(camera.width);
+        self.find_forbidden(frame);
+        if self.cameras.as_ref().is_none_or(|cameras| cameras.of_picture != *camera) {
+            self.cameras = Some(Cameras::new(camera, step));
+        }
+        self.draw_depth(light_field, frame);
+        if step > 1 {
+            self.reduced.take_masks(step, specular, &self.forbidden);
+        }
+        let (marked, forbidden) = if step > 1 {
+            (&self.reduced.specular, &self.reduced.forbidden)
+        } else {
+            (specular, &self.forbidden)
+        };
+        let scale = marked.width() as f32 / REFERENCE_WIDTH_PX;
         let settings = &self.settings;
         let reach = Scene::distance_of((settings.reach_px * scale).max(2.0));
         let ring = reach + Scene::distance_of((settings.margin_px * scale).max(6.0));
-        chamfer_distance(specular, ring + 1, &mut self.distance);
-        self.draw_depth(light_field, frame, camera);
-        self.find_forbidden(frame);
-        let Some(eye) = &frame.world_from_camera else { return };
+        chamfer_distance(marked, ring + 1, &mut self.distance);
+        let image = if step > 1 {
+            mean_of_squares(&frame.image, step, (&self.distance, ring), &mut self.reduced.image);
+            &self.reduced.image
+        } else {
+            &*frame.image
+        };
+        let (Some(eye), Some(cameras)) = (&frame.world_from_camera, &self.cameras) else {
+            return;
+        };
+        let camera = &cameras.reduced;
         let scene = Scene {
             light_field,
-            image: &frame.image,
+            image,
             depth: &self.depth,
             distance: &self.distance,
-            forbidden: &self.forbidden,
+            forbidden,
             camera,
             eye,
             depth_step: Division::by(depth_step(camera.width)),
             scale,
-            grid: Grid::over(specular.size()),
+            grid: Grid::over(marked.size()),
             reach,
             guard: Scene::distance_of(self.settings.guard_px * scale),
             ring,
@@ -196,7 +241,16 @@ impl SpecularitySubstitution {
             view: &mut provenance.view,
             confidence: &mut provenance.confidence,
         };
-        replace(&scene, &self.canvas, &self.settings, planes);
+        decide(&scene, &self.canvas, &self.settings, &mut self.shares);
+        let decision = Decision {
+            canvas: &self.canvas,
+            shares: &self.shares,
+            step,
+            grid: scene.grid,
+            blocks: &self.live.hole_blocks,
+            forbidden: &self.forbidden,
+        };
+        replace(&decision, planes);
         if let Some(alignment) = &mut frame.alignment {
             let sums = (self.fits.iter().filter(|fit| fit.is_needed()))
                 .map(ViewFit::statistics)
@@ -206,7 +260,7 @@ impl SpecularitySubstitution {
                     count: sum.count + one.count,
                 });
             if sums.count > 0.0 {
-                alignment.region_shift_px = (sums.shift / sums.count).sqrt();
+                alignment.region_shift_px = step as f32 * (sums.shift / sums.count).sqrt();
                 alignment.residual_levels = (sums.difference / sums.count).sqrt() * mean_brightness(&self.live);
             }
         }
