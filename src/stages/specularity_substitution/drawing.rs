@@ -243,22 +243,22 @@ impl Bench {
         }
         for y in block.top..(block.top + block.side).min(grid.height) {
             let doubtful = &doubtful[(y - block.top) / grid.step];
-            for x in block.left..(block.left + block.side).min(grid.width) {
-                if !doubtful[(x - block.left) / grid.step] || !scene.is_open(x, y) {
-                    continue;
-                }
-                let depth = scene.depth_at(x, y);
-                if depth > 0.0 {
-                    let color = scene.image.at(x, y);
-                    self.spots.push(Spot {
-                        x: x as u16,
-                        y: y as u16,
-                        depth,
-                        color,
-                        live: luma(color.map(f32::from)),
-                        clean: 0,
-                        luma: 0.0,
-                    });
+            let lefts = (block.left..).step_by(grid.step);
+            for (left, _) in lefts.zip(doubtful).filter(|(_, is_doubtful)| **is_doubtful) {
+                for x in left..(left + grid.step).min(grid.width) {
+                    let depth = scene.depth_at(x, y);
+                    if depth > 0.0 && scene.is_open(x, y) {
+                        let color = scene.image.at(x, y);
+                        self.spots.push(Spot {
+                            x: x as u16,
+                            y: y as u16,
+                            depth,
+                            color,
+                            live: luma(color.map(f32::from)),
+                            clean: 0,
+                            luma: 0.0,
+                        });
+                    }
                 }
             }
         }

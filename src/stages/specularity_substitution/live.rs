@@ -1,5 +1,7 @@
 //! The live picture, small, as the views are compared with it.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::image::color::luma;
@@ -90,14 +92,15 @@ impl Live {
         self.before.push(0);
         let mut all = 0;
         for (row, column) in (0..down).flat_map(|row| (0..across).map(move |column| (row, column))) {
-            let mut tile = Tile::EMPTY;
-            fill(&mut tile, &self.small, grid.small(), column, row);
-            self.places
-                .push(if tile.count > 0 { self.tiles.len() as u32 } else { NOWHERE });
-            if tile.count > 0 {
+            if has_good(&self.small, grid.small(), column, row) {
+                self.places.push(self.tiles.len() as u32);
+                let mut tile = Tile::EMPTY;
+                fill(&mut tile, &self.small, grid.small(), column, row);
+                all += tile.count as u32;
                 self.tiles.push(tile);
+            } else {
+                self.places.push(NOWHERE);
             }
-            all += tile.count as u32;
             self.before.push(all);
         }
     }
@@ -140,6 +143,17 @@ fn good_brightness(tile: &Tile) -> impl Iterator<Item = f32> {
     tile.brightness.iter().copied().filter(|&brightness| brightness > 0.0)
 }
 
+/// The columns and rows of a block in the small picture.
+fn reach_of(column: usize, row: usize, (width, height): (usize, usize)) -> (Range<usize>, Range<usize>) {
+    let along = |at: usize, end: usize| at * SMALL_PER_BLOCK..((at + 1) * SMALL_PER_BLOCK).min(end);
+    (along(column, width), along(row, height))
+}
+
+fn has_good(small: &[SmallPixel], size: (usize, usize), column: usize, row: usize) -> bool {
+    let (columns, mut rows) = reach_of(column, row, size);
+    rows.any(|y| small[y * size.0..][columns.clone()].iter().any(|pixel| pixel.depth > 0.0))
+}
+
 /// Fill the tile of a block from the small picture, `width` × `height`.
 fn fill(tile: &mut Tile, small: &[SmallPixel], (width, height): (usize, usize), column: usize, row: usize) {
     let good_at = |x: usize, y: usize| {
@@ -147,8 +161,9 @@ fn fill(tile: &mut Tile, small: &[SmallPixel], (width, height): (usize, usize), 
         pixel.filter(|pixel| pixel.depth > 0.0)
     };
     let brightness_at = |x: usize, y: usize| good_at(x, y).map(|pixel| luma(pixel.color) + DARK_LEVELS);
-    for (v, y) in (row * SMALL_PER_BLOCK..((row + 1) * SMALL_PER_BLOCK).min(height)).enumerate() {
-        for (u, x) in (column * SMALL_PER_BLOCK..((column + 1) * SMALL_PER_BLOCK).min(width)).enumerate() {
+    let (columns, rows) = reach_of(column, row, (width, height));
+    for (v, y) in rows.enumerate() {
+        for (u, x) in columns.clone().enumerate() {
             let Some(pixel) = good_at(x, y) else { continue };
             let place = v * SMALL_PER_BLOCK + u;
             tile.good[tile.count] = place as u8;

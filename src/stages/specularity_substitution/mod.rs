@@ -33,5 +33,6 @@ pub mod sight;
 pub mod small_view;
 pub mod stage;
 pub mod support;
+mod surface_depth;
 mod tile;
 pub mod view_fit;

@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use crate::frame::provenance_code;
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::wide;
 use crate::stages::specularity_substitution::blend::{Canvas, PLAIN};
 use crate::stages::specularity_substitution::grid::Grid;
 use crate::stages::specularity_substitution::scene::Scene;
@@ -36,25 +37,73 @@ pub struct Planes<'a> {
 /// Looked at, and found to be tissue.
 const TISSUE: u8 = 1;
 
-/// How much of each reduced pixel goes: 0 where nothing was known, [`TISSUE`], else the share of 255.
-pub fn decide(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, shares: &mut Image<u8>) {
-    let (width, height) = canvas.belief.size();
-    if shares.size() != (width, height) {
-        shares.resize(width, height, 0);
-    }
-    let rows = shares.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
-    rows.with_min_len(16).for_each(|(y, shares)| {
-        for (x, (share, &belief)) in shares.iter_mut().zip(canvas.belief.row(y)).enumerate() {
-            *share = if belief <= PLAIN {
-                0
-            } else {
-                match share_of(scene, canvas, settings, x, y) {
-                    share if share < LEAST_SHARE => TISSUE,
-                    share => (255.0 * share + 0.5) as u8,
-                }
-            };
+/// What becomes of the reduced pixels; keeps its memory.
+#[derive(Debug)]
+pub struct Shares {
+    /// 0 where nothing was known, [`TISSUE`], else how much goes, of 255.
+    own: Image<u8>,
+    /// The most of a pixel and those around it.
+    around: Image<u8>,
+}
+
+impl Default for Shares {
+    fn default() -> Self {
+        Self {
+            own: Image::filled(0, 0, 0),
+            around: Image::filled(0, 0, 0),
         }
-    });
+    }
+}
+
+impl Shares {
+    /// Decide how much of each reduced pixel goes.
+    pub fn decide(&mut self, scene: &Scene<'_>, canvas: &Canvas, settings: &Settings) {
+        let (width, height) = canvas.belief.size();
+        for plane in [&mut self.own, &mut self.around] {
+            if plane.size() != (width, height) {
+                plane.resize(width, height, 0);
+            }
+        }
+        let rows = self.own.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
+        rows.with_min_len(16).for_each(|(y, shares)| {
+            for (x, (share, &belief)) in shares.iter_mut().zip(canvas.belief.row(y)).enumerate() {
+                *share = if belief <= PLAIN {
+                    0
+                } else {
+                    match share_of(scene, canvas, settings, x, y) {
+                        share if share < LEAST_SHARE => TISSUE,
+                        share => (255.0 * share + 0.5) as u8,
+                    }
+                };
+            }
+        });
+        let own = &self.own;
+        let rows = self.around.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
+        rows.with_min_len(16).for_each(|(y, around)| {
+            let rows = [own.row(y.saturating_sub(1)), own.row(y), own.row((y + 1).min(height - 1))];
+            wide::run(MostAround { rows, around });
+        });
+    }
+}
+
+struct MostAround<'a> {
+    rows: [&'a [u8]; 3],
+    around: &'a mut [u8],
+}
+
+impl wide::Kernel for MostAround<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self { rows: [a, b, c], around } = self;
+        let last = around.len() - 1;
+        let column = |x: usize| a[x].max(b[x]).max(c[x]);
+        around[0] = column(0).max(column(last.min(1)));
+        around[last] = column(last).max(column(last.saturating_sub(1)));
+        for (out, ((a, b), c)) in around[1..].iter_mut().zip(a.windows(3).zip(b.windows(3)).zip(c.windows(3))) {
+            let column = |x: usize| a[x].max(b[x]).max(c[x]);
+            *out = column(0).max(column(1)).max(column(2));
+        }
+    }
 }
 
 /// What was decided, and the blocks of the reduced picture where anything was.
@@ -62,8 +111,8 @@ pub fn decide(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, shares: &
 pub struct Decision<'a> {
     /// The new colours.
     pub canvas: &'a Canvas,
-    /// See [`decide`].
-    pub shares: &'a Image<u8>,
+    /// How much goes.
+    pub shares: &'a Shares,
     /// Picture pixels along a reduced pixel.
     pub step: usize,
     /// Of the reduced picture.
@@ -109,39 +158,32 @@ struct Strip<'a> {
     confidence: &'a mut [u8],
 }
 
+/// Sums of colours times what they replace, and of that.
+type Weighted = [f32; 4];
+
 impl Decision<'_> {
     fn replace_block(&self, i: usize, j: usize, strip: &mut Strip<'_>) {
-        let (width, height) = self.shares.size();
+        let (width, height) = self.shares.own.size();
         let side = self.grid.block();
         for row in j * side..((j + 1) * side).min(height) {
+            let (own, around) = (self.shares.own.row(row), self.shares.around.row(row));
             for column in i * side..((i + 1) * side).min(width) {
+                if around[column] == 0 {
+                    continue;
+                }
                 let pixel = row * width + column;
-                let share = self.shares.pixels()[pixel];
-                if self.step == 1 {
-                    if share > TISSUE {
-                        let color = self.canvas.color.pixels()[pixel].map(f32::from);
-                        self.put(strip, (column, row), pixel, f32::from(share) / 255.0, color);
-                    } else if share == TISSUE {
-                        self.acquit(strip, (column, row));
-                    }
-                } else if self.is_replaced_around(column, row) {
+                if self.step > 1 && around[column] > TISSUE {
                     self.replace_square(column, row, strip);
-                } else if share == TISSUE {
+                } else if own[column] > TISSUE {
+                    let color = self.canvas.color.pixels()[pixel].map(f32::from);
+                    self.put(strip, (column, row), pixel, f32::from(own[column]) / 255.0, color);
+                } else if own[column] == TISSUE {
                     for place in self.square(column, row, strip) {
                         self.acquit(strip, place);
                     }
                 }
             }
         }
-    }
-
-    /// True if a reduced pixel or one around it is replaced.
-    #[inline(always)]
-    fn is_replaced_around(&self, column: usize, row: usize) -> bool {
-        let (width, height) = self.shares.size();
-        let columns = column.saturating_sub(1)..(column + 2).min(width);
-        (row.saturating_sub(1)..(row + 2).min(height))
-            .any(|row| self.shares.row(row)[columns.clone()].iter().any(|&s| s > TISSUE))
     }
 
     /// The pixels of a reduced one.
@@ -157,53 +199,51 @@ impl Decision<'_> {
 
     /// The pixels of a reduced one, linear between it and those around.
     fn replace_square(&self, column: usize, row: usize, strip: &mut Strip<'_>) {
-        let (shares, colors) = (self.shares.pixels(), self.canvas.color.pixels());
-        let (width, height) = self.shares.size();
-        let pixel = row * width + column;
-        let inverse = 1.0 / self.step as f32;
-        for (x, y) in self.square(column, row, strip) {
-            // Where the pixel's middle lies from that of the reduced one, and the neighbours on that side.
-            let aside = |at: usize, of: usize, end: usize| {
-                let off = ((at - of * self.step) as i32 as f32 + 0.5) * inverse - 0.5;
-                let next = if off < 0.0 {
-                    of.saturating_sub(1)
-                } else {
-                    (of + 1).min(end - 1)
-                };
-                (next, off.abs())
-            };
-            let ((beside, fx), (below, fy)) = (aside(x, column, width), aside(y, row, height));
-            let corners = [pixel, row * width + beside, below * width + column, below * width + beside];
-            let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-            let (mut share, mut color) = (0.0, [0.0; 3]);
-            for (corner, weight) in corners.into_iter().zip(weights) {
-                // Colours count as much as they replace.
-                if shares[corner] > TISSUE {
-                    let weight = weight * f32::from(shares[corner]);
-                    share += weight;
-                    for (sum, &channel) in color.iter_mut().zip(&colors[corner]) {
-                        *sum += weight * f32::from(channel);
-                    }
+        let (shares, colors) = (self.shares.own.pixels(), self.canvas.color.pixels());
+        let (width, height) = self.shares.own.size();
+        let columns = [column.saturating_sub(1), column, (column + 1).min(width - 1)];
+        let rows = [row.saturating_sub(1), row, (row + 1).min(height - 1)].map(|row| row * width);
+        let mut around = [[[0.0_f32; 4]; 3]; 3];
+        for (around, row) in around.iter_mut().zip(rows) {
+            for (weighted, column) in around.iter_mut().zip(columns) {
+                let (share, [r, g, b]) = (shares[row + column], colors[row + column]);
+                if share > TISSUE {
+                    let share = f32::from(share);
+                    *weighted = [share * f32::from(r), share * f32::from(g), share * f32::from(b), share];
                 }
             }
+        }
+        // A reduced pixel that is not replaced itself takes its origin from the neighbour that counts most.
+        let mut origin = (1, 1);
+        if around[1][1][3] == 0.0 {
+            for place in [(0, 1), (1, 0), (1, 2), (2, 1), (0, 0), (0, 2), (2, 0), (2, 2)] {
+                if around[place.0][place.1][3] > around[origin.0][origin.1][3] {
+                    origin = place;
+                }
+            }
+        }
+        let origin = rows[origin.0] + columns[origin.1];
+        let inverse = 1.0 / self.step as f32;
+        for (x, y) in self.square(column, row, strip) {
+            // Where the pixel's middle lies from that of the reduced one, and which neighbour is on that side.
+            let aside = |at: usize| {
+                let off = (at as i32 as f32 + 0.5) * inverse - 0.5;
+                (if off < 0.0 { 0 } else { 2 }, off.abs())
+            };
+            let ((i, fx), (j, fy)) = (aside(x - column * self.step), aside(y - row * self.step));
+            let level = mixed(&around[1][1], &around[1][i], fx);
+            let aside = mixed(&around[j][1], &around[j][i], fx);
+            let [r, g, b, share] = mixed(&level, &aside, fy);
             if share >= 255.0 * LEAST_SHARE {
-                // A reduced pixel that is not replaced itself takes its origin from the neighbour that counts most.
-                let origin = if shares[pixel] > TISSUE {
-                    pixel
-                } else {
-                    let counts = |corner: usize| {
-                        if shares[corners[corner]] > TISSUE {
-                            weights[corner]
-                        } else {
-                            0.0
-                        }
-                    };
-                    corners[(1..4).fold(0, |best, corner| if counts(corner) > counts(best) { corner } else { best })]
-                };
                 let inverse = 1.0 / share;
-                let color = [color[0] * inverse, color[1] * inverse, color[2] * inverse];
-                self.put(strip, (x, y), origin, share * (1.0 / 255.0), color);
-            } else if shares[pixel] != 0 {
+                self.put(
+                    strip,
+                    (x, y),
+                    origin,
+                    share * (1.0 / 255.0),
+                    [r * inverse, g * inverse, b * inverse],
+                );
+            } else if shares[rows[1] + column] != 0 {
                 self.acquit(strip, (x, y));
             }
         }
@@ -248,6 +288,15 @@ fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y
     let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
     let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
     smooth(brighter) * smooth((4.0 * near).min(1.0))
+}
+
+#[inline(always)]
+fn mixed(a: &Weighted, b: &Weighted, share: f32) -> Weighted {
+    let mut sum = [0.0; 4];
+    for i in 0..4 {
+        sum[i] = a[i] + share * (b[i] - a[i]);
+    }
+    sum
 }
 
 fn smooth(t: f32) -> f32 {

@@ -9,10 +9,8 @@ use crate::camera::model::CameraModel;
 use crate::frame::{Frame, Provenance, provenance_code};
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::chamfer_distance;
-use crate::image::hole_filling::HoleFiller;
 use crate::image::pool::Pool;
 use crate::image::specularity::REFERENCE_WIDTH_PX;
-use crate::light_field::rasterize::DepthRasterizer;
 use crate::light_field::view::LightField;
 use crate::pipeline::stage::{Stage, StageError};
 use crate::stages::specularity_substitution::blend::Canvas;
@@ -21,22 +19,13 @@ use crate::stages::specularity_substitution::drawing::Chosen;
 use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::reduced::{Reduced, mean_of_squares, reduced_camera, reduction_for};
-use crate::stages::specularity_substitution::replacement::{Decision, Planes, decide, replace};
+use crate::stages::specularity_substitution::replacement::{Decision, Planes, Shares, replace};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 use crate::stages::specularity_substitution::sight::{Vantage, Views};
 use crate::stages::specularity_substitution::small_view::SmallView;
-use crate::stages::specularity_substitution::support::Support;
+use crate::stages::specularity_substitution::surface_depth::{SurfaceDepth, depth_step};
 use crate::stages::specularity_substitution::view_fit::{Comparison, Statistics, ViewFit, Workbench};
-
-/// Depth is carried into holes over about 2 to this power, px of the depth's picture.
-const DEPTH_REACH_LEVELS: usize = 5;
-/// Widest picture over which depth is drawn pixel for pixel.
-const DEPTH_WIDTH_PX: usize = 480;
-/// Picture pixels along a pixel of the depth's picture.
-fn depth_step(width: usize) -> usize {
-    width.div_ceil(DEPTH_WIDTH_PX).max(1)
-}
 
 /// The picture's camera, and what is made of it.
 #[derive(Debug)]
@@ -65,10 +54,7 @@ pub struct SpecularitySubstitution {
     settings: Settings,
     light_field: Option<Arc<LightField>>,
     small_views: Vec<SmallView>,
-    rasterizer: DepthRasterizer,
-    filler: HoleFiller,
-    support: Support,
-    depth: Image<f32>,
+    surface: SurfaceDepth,
     cameras: Option<Cameras>,
     reduced: Reduced,
     distance: Image<u16>,
@@ -80,7 +66,7 @@ pub struct SpecularitySubstitution {
     fits: Vec<ViewFit>,
     benches: ArrayQueue<Workbench>,
     canvas: Canvas,
-    shares: Image<u8>,
+    shares: Shares,
     out: Image<Rgb8>,
     codes: Pool<u8>,
     views: Pool<u16>,
@@ -97,10 +83,7 @@ impl SpecularitySubstitution {
             settings: settings.clone(),
             light_field,
             small_views,
-            rasterizer: DepthRasterizer::new(),
-            filler: HoleFiller::default(),
-            support: Support::default(),
-            depth: Image::filled(0, 0, 0.0),
+            surface: SurfaceDepth::default(),
             cameras: None,
             reduced: Reduced::default(),
             distance: Image::filled(0, 0, 0),
@@ -111,24 +94,11 @@ impl SpecularitySubstitution {
             fits,
             benches: ArrayQueue::new(64),
             canvas: Canvas::default(),
-            shares: Image::filled(0, 0, 0),
+            shares: Shares::default(),
             out: Image::filled(0, 0, [0; 3]),
             codes: Pool::new(64),
             views: Pool::new(32),
         }
-    }
-
-    fn draw_depth(&mut self, light_field: &LightField, frame: &Frame) {
-        let (Some(pose), Some(cameras)) = (&frame.world_from_camera, &self.cameras) else {
-            return;
-        };
-        let coarse = &cameras.of_depth;
-        self.rasterizer.render(&light_field.surface, coarse, pose, &mut self.depth);
-        // The survey's stereo is blind under its own specularities: there the surface is taken to go on smoothly. Only the place is
-        // guessed so, not the colour, and a wrong place shows on the ring.
-        self.support.learn(&self.depth);
-        self.filler.fill(&mut self.depth, DEPTH_REACH_LEVELS);
-        self.support.restrict(&mut self.depth);
     }
 
     /// Where nothing may be touched or learnt.
@@ -154,7 +124,9 @@ impl SpecularitySubstitution {
         if self.cameras.as_ref().is_none_or(|cameras| cameras.of_picture != *camera) {
             self.cameras = Some(Cameras::new(camera, step));
         }
-        self.draw_depth(light_field, frame);
+        let (Some(eye), Some(cameras)) = (&frame.world_from_camera, &self.cameras) else {
+            return;
+        };
         if step > 1 {
             self.reduced.take_masks(step, specular, &self.forbidden);
         }
@@ -167,21 +139,25 @@ impl SpecularitySubstitution {
         let settings = &self.settings;
         let reach = Scene::distance_of((settings.reach_px * scale).max(2.0));
         let ring = reach + Scene::distance_of((settings.margin_px * scale).max(6.0));
-        chamfer_distance(marked, ring + 1, &mut self.distance);
-        let image = if step > 1 {
-            mean_of_squares(&frame.image, step, (&self.distance, ring), &mut self.reduced.image);
-            &self.reduced.image
-        } else {
-            &*frame.image
-        };
-        let (Some(eye), Some(cameras)) = (&frame.world_from_camera, &self.cameras) else {
-            return;
-        };
+        let (surface, distance, reduced, out) = (&mut self.surface, &mut self.distance, &mut self.reduced.image, &mut self.out);
+        let (codes, views) = (&self.codes, &self.views);
+        let (_, mut provenance) = rayon::join(
+            || surface.draw(light_field, &cameras.of_depth, eye),
+            || {
+                chamfer_distance(marked, ring + 1, distance);
+                if step > 1 {
+                    mean_of_squares(&frame.image, step, (distance, ring), reduced);
+                }
+                out.copy_from(&frame.image);
+                all_left(codes, views, specular)
+            },
+        );
+        let image = if step > 1 { &self.reduced.image } else { &*frame.image };
         let camera = &cameras.reduced;
         let scene = Scene {
             light_field,
             image,
-            depth: &self.depth,
+            depth: &self.surface.depth,
             distance: &self.distance,
             forbidden,
             camera,
@@ -233,15 +209,13 @@ impl SpecularitySubstitution {
             vantages: &self.vantages,
         };
         self.canvas.draw(&scene, &self.live, &chosen);
-        self.out.copy_from(&frame.image);
-        let mut provenance = all_left(&self.codes, &self.views, specular);
         let planes = Planes {
             image: &mut self.out,
             code: &mut provenance.code,
             view: &mut provenance.view,
             confidence: &mut provenance.confidence,
         };
-        decide(&scene, &self.canvas, &self.settings, &mut self.shares);
+        self.shares.decide(&scene, &self.canvas, &self.settings);
         let decision = Decision {
             canvas: &self.canvas,
             shares: &self.shares,
