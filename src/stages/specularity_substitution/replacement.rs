@@ -77,6 +77,12 @@ impl Shares {
                 };
             }
         });
+        self.look_around();
+    }
+
+    /// Fill `around`.
+    fn look_around(&mut self) {
+        let (width, height) = self.own.size();
         let own = &self.own;
         let rows = self.around.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
         rows.with_min_len(16).for_each(|(y, around)| {
@@ -319,4 +325,127 @@ fn mean_of_neighbours(canvas: &Canvas, x: usize, y: usize) -> f32 {
         }
     }
     sum / f32::max(count, 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const OLD: Rgb8 = [200, 180, 160];
+    const NEW: Rgb8 = [120, 60, 40];
+
+    /// A picture of which a disc of reduced pixels is replaced wholly; its right half may not be touched.
+    struct Replaced {
+        image: Image<Rgb8>,
+        code: Image<u8>,
+        view: Image<u16>,
+    }
+
+    fn replaced(step: usize, forbidden_from: usize) -> Replaced {
+        let (width, height) = (96, 64);
+        let grid = Grid::over((width, height));
+        let mut canvas = Canvas::default();
+        canvas.color.resize(width, height, NEW);
+        canvas.belief.resize(width, height, 200);
+        canvas.source.resize(width, height, 7);
+        let mut shares = Shares::default();
+        shares.own.resize(width, height, 0);
+        shares.around.resize(width, height, 0);
+        for y in 0..height {
+            for x in 0..width {
+                let far = (x as f32 - 48.0).hypot(y as f32 - 32.0);
+                shares.own.set(x, y, if far < 10.0 { 255 } else { u8::from(far < 14.0) });
+            }
+        }
+        shares.look_around();
+        // One pixel more than whole squares.
+        let (full_width, full_height) = (step * width - usize::from(step > 1), step * height - usize::from(step > 1));
+        let mut out = Replaced {
+            image: Image::filled(full_width, full_height, OLD),
+            code: Image::filled(full_width, full_height, provenance_code::LEFT),
+            view: Image::filled(full_width, full_height, 0),
+        };
+        let mut forbidden = Image::filled(full_width, full_height, 0);
+        for y in 0..full_height {
+            forbidden.row_mut(y)[forbidden_from.min(full_width)..].fill(255);
+        }
+        let decision = Decision {
+            canvas: &canvas,
+            shares: &shares,
+            step,
+            grid,
+            blocks: &vec![1; grid.blocks().0 * grid.blocks().1],
+            forbidden: &forbidden,
+        };
+        let planes = Planes {
+            image: &mut out.image,
+            code: &mut out.code,
+            view: &mut out.view,
+            confidence: &mut Image::filled(full_width, full_height, 0),
+        };
+        replace(&decision, planes);
+        out
+    }
+
+    #[test]
+    fn a_disc_is_replaced_at_every_size_with_a_soft_rim() {
+        for step in [1, 2, 3] {
+            let out = replaced(step, usize::MAX);
+            let middle = |at: usize| (at as f32 + 0.5) / step as f32 - 0.5;
+            for y in 0..out.image.height() {
+                for x in 0..out.image.width() {
+                    let far = (middle(x) - 48.0).hypot(middle(y) - 32.0);
+                    let (color, code) = (out.image.at(x, y), out.code.at(x, y));
+                    // Between two reduced pixels the share falls from one to zero.
+                    if far < 8.5 {
+                        assert_eq!((color, code), (NEW, provenance_code::LIGHT_FIELD), "({x}, {y}) at {step}");
+                        assert_eq!(out.view.at(x, y), 7);
+                    } else if far > 11.5 {
+                        assert_eq!(color, OLD, "({x}, {y}) at {step}");
+                    }
+                    if (11.5..12.5).contains(&far) {
+                        assert_eq!(code, provenance_code::UNTOUCHED, "({x}, {y}) at {step}");
+                    } else if far > 15.5 {
+                        assert_eq!(code, provenance_code::LEFT, "({x}, {y}) at {step}");
+                    }
+                    assert!((0..3).all(|c| (NEW[c]..=OLD[c]).contains(&color[c])));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_forbidden_in_the_picture_stays_to_the_pixel() {
+        for step in [1, 2, 3] {
+            let border = 48 * step + 1;
+            let out = replaced(step, border);
+            for y in 0..out.image.height() {
+                assert!(out.image.row(y)[border..].iter().all(|&pixel| pixel == OLD));
+                assert!(out.code.row(y)[border..].iter().all(|&code| code == provenance_code::LEFT));
+            }
+            assert_eq!(out.image.at(border - 1, 32 * step), NEW);
+        }
+    }
+
+    #[test]
+    fn the_most_around_equals_its_plain_twin() {
+        for (width, height) in [(1, 1), (2, 3), (17, 9)] {
+            let mut shares = Shares::default();
+            shares.own.resize(width, height, 0);
+            shares.around.resize(width, height, 0);
+            for (i, share) in shares.own.pixels_mut().iter_mut().enumerate() {
+                *share = (i * 89 % 251) as u8;
+            }
+            shares.look_around();
+            for y in 0..height {
+                for x in 0..width {
+                    let rows = y.saturating_sub(1)..(y + 2).min(height);
+                    let most = rows
+                        .flat_map(|v| shares.own.row(v)[x.saturating_sub(1)..(x + 2).min(width)].iter())
+                        .max();
+                    assert_eq!(Some(&shares.around.at(x, y)), most, "({x}, {y}) of {width}");
+                }
+            }
+        }
+    }
 }
