@@ -28,6 +28,8 @@ const BRIGHTER_AT_MOST: f32 = 4.0;
 const WARM_SHARE: f32 = 0.7;
 /// Rounds end when no shift changes by more, small px.
 const STILL: f32 = 0.12;
+/// The same for a warm view: the next frame goes on from here.
+const STILL_WHEN_WARM: f32 = 0.35;
 /// Blocks around a corner that a view is looked at, about the width of the ring.
 const CONTEXT_BLOCKS: usize = 2;
 /// It is looked at farther where there are fewer good pixels than this …
@@ -173,12 +175,8 @@ impl ViewFit {
         bench.sums.resize(across * down, [0.0; 8]);
         bench.equations.resize(across * down, [0.0; 8]);
         bench.seen.resize(across * down, EMPTY);
-        let rounds = if self.is_warm(across) {
-            1
-        } else {
-            with.settings.ring_rounds.max(1)
-        };
-        for round in 0..rounds {
+        let still = if self.is_warm(across) { STILL_WHEN_WARM } else { STILL };
+        for round in 0..with.settings.ring_rounds.max(1) {
             wide::run(Draw {
                 fit: self,
                 with,
@@ -190,14 +188,14 @@ impl ViewFit {
             wide::run(Compare { fit: self, with, bench });
             bench.smoother.smooth(with.grid, self.span, &mut bench.equations);
             self.judge(with, &bench.equations);
-            if !with.settings.align_on_ring || self.shift(with, &bench.equations) < STILL {
+            if !with.settings.align_on_ring || self.shift(with, &bench.equations) < still {
                 break;
             }
         }
         self.statistics = self.summed_up(across, with.live, &bench.equations);
     }
 
-    /// True if most of what is looked at was looked at in the last frame too: one more round is enough then, the next frame goes on.
+    /// True if most of what is looked at was looked at in the last frame too.
     fn is_warm(&self, across: usize) -> bool {
         let (mut known, mut all) = (0, 0);
         for row in self.span.rows() {
