@@ -10,7 +10,7 @@ use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::small_view::SmallView;
 
-/// A small pixel of a view counts as a clean sighting from this confidence on; below it speaks only where nobody else does.
+/// A view's pixel counts as a clean sighting from this confidence on; below it speaks only where nobody else does.
 const HEARD_FROM: u8 = 120;
 
 /// Nearer to a view's border than this share of its width a place is not seen …
@@ -69,7 +69,9 @@ impl Views<'_> {
     pub fn look(&self, view: u16, places: &[Place]) -> Sights {
         let view = usize::from(view);
         let vantage = self.vantages[view].as_ref();
-        vantage.map_or_else(Sights::default, |vantage| vantage.look(&self.small[view], places))
+        vantage.map_or_else(Sights::default, |vantage| {
+            vantage.look(&self.full[view], &self.small[view], places)
+        })
     }
 }
 
@@ -126,11 +128,12 @@ impl Vantage {
         angle + RESOLUTION_PENALTY * resolution + 1e-4 + BORDER_PENALTY * (1.0 - border).max(0.0)
     }
 
-    /// How the view, `small`, sees each of at most 64 places.
-    pub fn look(&self, small: &SmallView, places: &[Place]) -> Sights {
+    /// How the view, of which `small` is the small copy, sees each of at most 64 places.
+    pub fn look(&self, view: &View, small: &SmallView, places: &[Place]) -> Sights {
         let mut sights = Sights::default();
         wide::run(Look {
-            mapping: &self.small,
+            mapping: &self.mapping,
+            view,
             small,
             places,
             sights: &mut sights,
@@ -142,6 +145,7 @@ impl Vantage {
 /// One view asked for many places.
 struct Look<'a> {
     mapping: &'a Mapping,
+    view: &'a View,
     small: &'a SmallView,
     places: &'a [Place],
     sights: &'a mut Sights,
@@ -150,21 +154,23 @@ struct Look<'a> {
 impl wide::Kernel for Look<'_> {
     #[inline(always)]
     fn run(self) {
-        let (last_x, last_y) = self.small.last();
-        let mut mapped = [(0.0_f32, 0.0_f32, 0.0_f32); PLACES_AT_ONCE];
+        let (width, height) = self.view.image.size();
+        let (last_x, last_y) = (width as f32 - 2.0, height as f32 - 2.0);
+        let confidences = self.view.confidence.pixels();
+        let mut mapped = [(0_usize, 0_usize, 0.0_f32); PLACES_AT_ONCE];
         for (mapped, place) in mapped.iter_mut().zip(self.places) {
             let (x, y, depth) = self.mapping.apply(place.x, place.y, place.depth);
-            if depth > 0.0 && x >= 0.0 && y >= 0.0 && x < last_x && y < last_y {
-                *mapped = (x + 0.5, y + 0.5, depth);
-                self.small.fetch(x + 0.5, y + 0.5);
+            if depth > 0.0 && x >= 1.0 && y >= 1.0 && x < last_x && y < last_y {
+                let (x, y) = ((x + 0.5) as i32 as usize, (y + 0.5) as i32 as usize);
+                wide::fetch(confidences, y * width + x);
+                self.small.fetch_depth(x, y);
+                *mapped = (x, y, depth);
             }
         }
-        for (index, (x, y, depth)) in mapped.into_iter().enumerate() {
-            if depth <= 0.0 {
-                continue;
-            }
-            let (confidence, held) = self.small.at(x as i32 as usize, y as i32 as usize);
-            let is_seen = (confidence > 0) & is_unoccluded(held, depth);
+        for (index, (x, y, depth)) in mapped.into_iter().enumerate().filter(|(_, (_, _, depth))| *depth > 0.0) {
+            // The view's own confidence: between two lobes it sees less than a small pixel clean.
+            let confidence = confidences[y * width + x];
+            let is_seen = (confidence > 0) & is_unoccluded(self.small.depth_at(x, y), depth);
             self.sights.seen |= u64::from(is_seen) << index;
             self.sights.clean |= u64::from(is_seen & (confidence >= HEARD_FROM)) << index;
         }

@@ -98,19 +98,12 @@ impl SmallView {
         (y / TILE * self.across + x / TILE) * (PITCH * PITCH) + y % TILE * PITCH + x % TILE
     }
 
-    /// Ask for what [`Self::between`] and [`Self::at`] will read there.
+    /// Ask for what [`Self::between`] will read there.
     #[inline(always)]
     pub fn fetch(&self, u: f32, v: f32) {
         let index = self.index(u as i32 as usize, v as i32 as usize);
         wide::fetch(&self.pixels, index);
         wide::fetch(&self.pixels, index + PITCH + 1);
-    }
-
-    /// The least confidence of a pixel of this, and its depth, mm, 0 where unknown.
-    #[inline(always)]
-    pub fn at(&self, x: usize, y: usize) -> (u8, f32) {
-        let pixel = &self.pixels[self.index(x, y)];
-        (pixel.color[3], pixel.depth)
     }
 
     /// What is shown at column `u` and row `v`, linear between pixels; both at least 0 and before the last.
