@@ -49,9 +49,7 @@ impl Mapping {
         let inverse = 1.0 / depth;
         (row(0) * inverse, row(1) * inverse, depth)
     }
-}
 
-impl Mapping {
     /// [`Self::apply`] for pixels `step` apart along a row, the first at column `left`, at the depths `z`: columns, rows and depths, each as
     /// many as there are depths.
     #[inline(always)]

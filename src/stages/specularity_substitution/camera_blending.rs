@@ -147,8 +147,7 @@ impl CameraBlending {
             }
         }
         self.samples.clear();
-        let (across, down) = grid.blocks();
-        for (i, j) in (0..down).flat_map(|j| (0..across).map(move |i| (i, j))) {
+        for (i, j) in grid.everywhere().places() {
             let places = places_of_block(grid, i, j).map(|p| self.lattice[p]).filter(|p| p.depth > 0.0);
             // The one nearest to the mask stands for all.
             self.samples
@@ -359,11 +358,7 @@ mod tests {
     /// Voices at the corner nearest to the hole's middle.
     fn voices(example: &Example) -> Vec<Voice> {
         let (scene, vantages) = (example.scene(), example.vantages());
-        let views = Views {
-            full: &example.light_field.views,
-            small: &example.small_views,
-            vantages: &vantages,
-        };
+        let views = example.views(&vantages);
         let mut blending = CameraBlending::default();
         let mut live = Live::default();
         live.look(&scene);

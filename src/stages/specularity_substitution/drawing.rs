@@ -527,17 +527,12 @@ mod tests {
     use crate::stages::specularity_substitution::example::{Example, HOLE, in_hole};
     use crate::stages::specularity_substitution::live::Live;
     use crate::stages::specularity_substitution::settings::Settings;
-    use crate::stages::specularity_substitution::sight::Views;
     use crate::stages::specularity_substitution::view_fit::{Comparison, Workbench};
 
     /// Spots and what was blended of them in the block of the hole's middle.
     fn blended(example: &Example) -> Bench {
         let (scene, vantages, settings) = (example.scene(), example.vantages(), Settings::default());
-        let views = Views {
-            full: &example.light_field.views,
-            small: &example.small_views,
-            vantages: &vantages,
-        };
+        let views = example.views(&vantages);
         let (mut blending, mut live) = (CameraBlending::default(), Live::default());
         live.look(&scene);
         blending.choose(&scene, &live.holes, &views, MOST_MEMBERS);

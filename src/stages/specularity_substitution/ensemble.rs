@@ -137,11 +137,7 @@ mod tests {
     fn the_only_view_that_sees_a_place_takes_part_and_the_limit_holds() {
         let (example, places) = example();
         let vantages = example.vantages();
-        let views = Views {
-            full: &example.light_field.views,
-            small: &example.small_views,
-            vantages: &vantages,
-        };
+        let views = example.views(&vantages);
         let mut ensemble = Ensemble::default();
         for limit in [2, 3, 5] {
             ensemble.gather(&views, &places, limit);
@@ -155,11 +151,7 @@ mod tests {
     fn members_stay_unless_another_view_is_clearly_better() {
         let (example, places) = example();
         let vantages = example.vantages();
-        let views = Views {
-            full: &example.light_field.views,
-            small: &example.small_views,
-            vantages: &vantages,
-        };
+        let views = example.views(&vantages);
         let mut ensemble = Ensemble::default();
         ensemble.gather(&views, &places, 3);
         let before = ensemble.members().to_vec();

@@ -14,7 +14,7 @@ use crate::image::distance::chamfer_distance;
 use crate::light_field::view::{LightField, View};
 use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::scene::Scene;
-use crate::stages::specularity_substitution::sight::Vantage;
+use crate::stages::specularity_substitution::sight::{Vantage, Views};
 use crate::stages::specularity_substitution::small_view::SmallView;
 use crate::time::Timestamp;
 
@@ -139,8 +139,6 @@ impl Example {
             depth: &self.depth,
             distance: &self.distance,
             forbidden: &self.forbidden,
-            camera: &self.camera,
-            eye: &self.eye,
             depth_step: Division::by(1),
             scale: 0.5,
             grid: Grid::over(SIZE),
@@ -155,6 +153,14 @@ impl Example {
         views
             .map(|(view, small)| Vantage::new(&self.camera, &self.eye, view, small))
             .collect()
+    }
+
+    pub fn views<'a>(&'a self, vantages: &'a [Option<Vantage>]) -> Views<'a> {
+        Views {
+            full: &self.light_field.views,
+            small: &self.small_views,
+            vantages,
+        }
     }
 
     /// What the live picture would show without the lamp.

@@ -86,6 +86,17 @@ impl Grid {
         (self.across.div_ceil(CELLS_PER_BLOCK), self.down.div_ceil(CELLS_PER_BLOCK))
     }
 
+    /// All blocks.
+    pub fn everywhere(&self) -> Span {
+        let (right, bottom) = self.blocks();
+        Span {
+            left: 0,
+            top: 0,
+            right,
+            bottom,
+        }
+    }
+
     /// Size of the small picture.
     pub fn small(&self) -> (usize, usize) {
         (self.across * SMALL_PER_CELL, self.down * SMALL_PER_CELL)
@@ -180,6 +191,13 @@ impl Span {
     /// Rows of the rectangle.
     pub fn rows(self) -> std::ops::Range<usize> {
         self.top..self.bottom
+    }
+
+    /// Its blocks, row by row, as (column, row).
+    #[inline(always)]
+    pub fn places(self) -> impl Iterator<Item = (usize, usize)> {
+        self.rows()
+            .flat_map(move |row| (self.left..self.right).map(move |column| (column, row)))
     }
 
     /// The part of row `y` of a lattice `across` blocks wide that lies in the rectangle.
@@ -392,15 +410,6 @@ mod tests {
         }
     }
 
-    fn everywhere(grid: Grid) -> Span {
-        Span {
-            left: 0,
-            top: 0,
-            right: grid.blocks().0,
-            bottom: grid.blocks().1,
-        }
-    }
-
     #[test]
     fn smoothing_keeps_a_constant_ratio_and_fills_empty_blocks_from_afar() {
         let grid = Grid::over((960, 540));
@@ -411,7 +420,7 @@ mod tests {
                 blocks[y * across + x] = [2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0];
             }
         }
-        Smoother::default().smooth(grid, everywhere(grid), &mut blocks);
+        Smoother::default().smooth(grid, grid.everywhere(), &mut blocks);
         for (x, y) in [(10, 10), (13, 11), (17, 12)] {
             let block = blocks[y * across + x];
             assert!(

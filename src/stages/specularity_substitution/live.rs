@@ -85,13 +85,12 @@ impl Live {
 
     /// Put the good pixels into the tiles of their blocks.
     fn gather(&mut self, grid: Grid) {
-        let (across, down) = grid.blocks();
         self.tiles.clear();
         self.places.clear();
         self.before.clear();
         self.before.push(0);
         let mut all = 0;
-        for (row, column) in (0..down).flat_map(|row| (0..across).map(move |column| (row, column))) {
+        for (column, row) in grid.everywhere().places() {
             if has_good(&self.small, grid.small(), column, row) {
                 self.places.push(self.tiles.len() as u32);
                 let mut tile = Tile::EMPTY;
@@ -108,12 +107,7 @@ impl Live {
     /// How much the tissue differs from its own mean, block by block.
     fn measure_detail(&mut self, grid: Grid) {
         let (across, down) = grid.blocks();
-        let all = Span {
-            left: 0,
-            top: 0,
-            right: across,
-            bottom: down,
-        };
+        let all = grid.everywhere();
         // First the mean, then the deviation from it.
         self.detail.clear();
         for block in 0..across * down {
@@ -239,14 +233,7 @@ mod tests {
         let scene = example.scene();
         let mut live = Live::default();
         live.look(&scene);
-        let (across, down) = scene.grid.blocks();
-        let all = Span {
-            left: 0,
-            top: 0,
-            right: across,
-            bottom: down,
-        };
-        let good = live.good_in(scene.grid, all);
+        let good = live.good_in(scene.grid, scene.grid.everywhere());
         assert!(good > 800);
         let mut found = 0;
         // In the example a small pixel is a pixel.

@@ -1,8 +1,5 @@
 //! What the parts of the substitution look at together.
 
-use crate::camera::model::CameraModel;
-use crate::geometry::space::{Camera, World};
-use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::UNITS_PER_PX;
 use crate::light_field::view::LightField;
@@ -21,10 +18,6 @@ pub struct Scene<'a> {
     pub distance: &'a Image<u16>,
     /// 255 where nothing may be touched or learnt: instruments, outside the field.
     pub forbidden: &'a Mask,
-    /// Explains the picture.
-    pub camera: &'a CameraModel,
-    /// Where it was taken.
-    pub eye: &'a Transform<World, Camera>,
     /// Picture pixels along a pixel of `depth`.
     pub depth_step: Division,
     /// Width of the picture over the width for which lengths are given.

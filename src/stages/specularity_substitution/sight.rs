@@ -212,11 +212,7 @@ mod tests {
         example.light_field.views[3].depth.fill(0.8 * DEPTH);
         example.look_again();
         let vantages = example.vantages();
-        let views = Views {
-            full: &example.light_field.views,
-            small: &example.small_views,
-            vantages: &vantages,
-        };
+        let views = example.views(&vantages);
         // The place in the middle of the hole, twice.
         let sights = [0, 1, 2, 3]
             .map(|view| views.look(view, &[hole(); 2]))

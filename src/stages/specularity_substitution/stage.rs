@@ -160,8 +160,6 @@ impl SpecularitySubstitution {
             depth: &self.surface.depth,
             distance: &self.distance,
             forbidden,
-            camera,
-            eye,
             depth_step: Division::by(depth_step(camera.width)),
             scale,
             grid: Grid::over(marked.size()),

@@ -299,11 +299,7 @@ impl wide::Kernel for Draw<'_> {
     fn run(self) {
         let Self { fit, with, bench, again } = self;
         let across = with.grid.blocks().0;
-        for (row, column) in fit
-            .span
-            .rows()
-            .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
-        {
+        for (column, row) in fit.span.places() {
             let block = row * across + column;
             bench.sums[block] = [0.0; 8];
             if fit.context[block] == 0 {
@@ -404,11 +400,7 @@ impl wide::Kernel for Compare<'_> {
     fn run(self) {
         let Self { fit, with, bench } = self;
         let across = with.grid.blocks().0;
-        for (row, column) in fit
-            .span
-            .rows()
-            .flat_map(|row| (fit.span.left..fit.span.right).map(move |column| (row, column)))
-        {
+        for (column, row) in fit.span.places() {
             let block = row * across + column;
             bench.equations[block] = [0.0; 8];
             if fit.context[block] == 0 || bench.sums[block][0] <= 0.0 {
