@@ -105,7 +105,10 @@ fn on_one_core(operation: &Operation, front: Front) -> Vec<Alone> {
             if frame.id.0 >= WARM_UP {
                 times.push(ms);
             }
-            let masks = [&frame.specularities, &frame.instruments].into_iter().flatten();
+            let masks = frame
+                .analysis
+                .iter()
+                .flat_map(|seen| [&seen.specularities, &seen.instruments]);
             *fingerprint = masks.fold(hash(*fingerprint, frame.image.as_bytes()), |hashed, mask| {
                 hash(hashed, mask.pixels())
             });

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
-use crate::image::buffer::{Mask, Rgb8};
+use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::pool::Pooled;
 use crate::time::{Span, Timestamp};
 
@@ -45,10 +45,32 @@ pub enum PoseOrigin {
 pub struct Provenance {
     /// A [`provenance_code`] per pixel.
     pub code: Pooled<u8>,
-    /// Index of the view that spoke loudest, where `code` is `LIGHT_FIELD` or `RECENT`.
+    /// Index of the view that spoke loudest, where `code` is `LIGHT_FIELD` or `RECENT`; anything elsewhere.
     pub view: Pooled<u16>,
-    /// How sure, 0–255, where filled.
+    /// How sure, 0–255, where filled; anything elsewhere.
     pub confidence: Pooled<u8>,
+}
+
+/// The picture at the size at which it is looked at, and what was seen in it.
+#[derive(Debug)]
+pub struct Analysis {
+    /// Picture pixels along a pixel of everything below; squares cut off by the right and lower border count.
+    pub step: usize,
+    /// Mean colors of the squares; `None` where the picture itself is looked at.
+    pub reduced: Option<Pooled<Rgb8>>,
+    /// 255 inside the image field, squares that reach out of it are outside; `None` = everywhere.
+    pub field_of_view: Option<Arc<Mask>>,
+    /// 255 where the lamp's mirror image hides the tissue.
+    pub specularities: Pooled<u8>,
+    /// 255 where an instrument is seen.
+    pub instruments: Pooled<u8>,
+}
+
+impl Analysis {
+    /// What is looked at of the frame's `picture`.
+    pub fn image<'a>(&'a self, picture: &'a Image<Rgb8>) -> &'a Image<Rgb8> {
+        self.reduced.as_deref().unwrap_or(picture)
+    }
 }
 
 /// What the light field had to say about a frame, in figures.
@@ -110,10 +132,8 @@ pub struct Frame {
     pub camera_speed: Option<(f64, f64)>,
     /// How well the light field fits.
     pub alignment: Option<Alignment>,
-    /// 255 where the lamp's mirror image hides the tissue.
-    pub specularities: Option<Pooled<u8>>,
-    /// 255 where an instrument is seen.
-    pub instruments: Option<Pooled<u8>>,
+    /// What was seen in the picture as it leaves the undistortion.
+    pub analysis: Option<Analysis>,
     /// What was replaced, and by what.
     pub provenance: Option<Provenance>,
     /// Where the frame spent its time.
@@ -138,8 +158,7 @@ impl Frame {
             pose_origin: PoseOrigin::Missing,
             camera_speed: None,
             alignment: None,
-            specularities: None,
-            instruments: None,
+            analysis: None,
             provenance: None,
             timings: Vec::with_capacity(12),
         }

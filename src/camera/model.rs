@@ -58,6 +58,15 @@ impl CameraModel {
         }
     }
 
+    /// The camera of its picture reduced by averaging squares of `step` pixels, squares cut off by the border counted.
+    pub fn reduced(&self, step: usize) -> Self {
+        Self {
+            width: self.width.div_ceil(step),
+            height: self.height.div_ceil(step),
+            ..self.scaled(1.0 / step as f64)
+        }
+    }
+
     /// True if `pixel` lies in the picture, at least `margin` px from its border.
     pub fn contains(&self, pixel: Pixel, margin: f64) -> bool {
         pixel.x >= margin

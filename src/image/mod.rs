@@ -12,6 +12,7 @@ pub mod hole_filling;
 pub mod patch;
 pub mod pool;
 pub mod pyramid;
+pub mod reduction;
 pub mod remap;
 mod remap_bicubic;
 mod remap_bilinear;

@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use crate::frame::{Alignment, Frame, PoseOrigin};
+use crate::frame::{Alignment, Analysis, Frame, PoseOrigin};
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::blur::BlurScratch;
@@ -95,6 +95,14 @@ impl PoseRefinement {
     }
 }
 
+/// Tissue without the lamp's mirror image, inside the image field.
+fn usable_in(analysis: &Analysis) -> Usable<'_> {
+    Usable {
+        without: [Some(&analysis.specularities), Some(&analysis.instruments)],
+        within: analysis.field_of_view.as_deref().map(|field| (field, 0)),
+    }
+}
+
 impl Stage for PoseRefinement {
     fn name(&self) -> &'static str {
         "pose_refinement"
@@ -109,11 +117,15 @@ impl Stage for PoseRefinement {
         if frame.scene_cut {
             self.reset();
         }
-        let usable = Usable {
-            without: [frame.specularities.as_deref(), frame.instruments.as_deref()],
-            within: frame.field_of_view.as_deref().map(|field| (field, 0)),
+        let Some(analysis) = &frame.analysis else {
+            return Err(StageError(
+                "no specularity mask: the detection stage must run before the pose refinement".into(),
+            ));
         };
-        self.pyramid.build(&frame.image, &usable, &mut self.scratch);
+        let step = analysis.step;
+        let camera = camera.reduced(step);
+        self.pyramid
+            .build(analysis.image(&frame.image), &usable_in(analysis), &mut self.scratch);
         let prior = frame.world_from_camera;
         let aligned = self
             .best_guess(frame, &camera)
@@ -132,7 +144,7 @@ impl Stage for PoseRefinement {
         let correction_px = prior.map_or(0.0, |prior| {
             let away = prior.inverse() * found.world_from_camera;
             // A turn moves the whole picture; a shift moves it by what it is at the scene, which `moved_px` measured from the guess.
-            found.moved_px.max((camera.intrinsics.fx * away.rotation().angle()) as f32)
+            step as f32 * found.moved_px.max((camera.intrinsics.fx * away.rotation().angle()) as f32)
         });
         frame.world_from_camera = Some(found.world_from_camera);
         frame.alignment = Some(Alignment {

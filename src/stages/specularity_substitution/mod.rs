@@ -25,7 +25,6 @@ pub mod example;
 pub mod grid;
 pub mod live;
 pub mod lookup;
-pub mod reduced;
 mod replacement;
 pub mod scene;
 pub mod settings;

@@ -1,9 +1,12 @@
 //! The picture replaced where it is brighter than what was measured: decided in the reduced picture, done in the picture itself.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::frame::provenance_code;
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::components::set_runs;
 use crate::image::wide;
 use crate::stages::specularity_substitution::blend::{Canvas, PLAIN};
 use crate::stages::specularity_substitution::grid::Grid;
@@ -24,13 +27,13 @@ const AGAINST_DETECTED: f32 = 0.4;
 /// Planes to fill, all of the picture's size.
 #[derive(Debug)]
 pub struct Planes<'a> {
-    /// The new picture; holds the old one.
+    /// The new picture.
     pub image: &'a mut Image<Rgb8>,
-    /// Provenance codes; hold what was detected.
+    /// Provenance codes.
     pub code: &'a mut Image<u8>,
-    /// Loudest view of each replaced pixel.
+    /// Loudest view; filled only where a pixel is replaced.
     pub view: &'a mut Image<u16>,
-    /// How sure each replaced pixel is.
+    /// How sure; filled only where a pixel is replaced.
     pub confidence: &'a mut Image<u8>,
 }
 
@@ -66,15 +69,18 @@ impl Shares {
         }
         let rows = self.own.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
         rows.with_min_len(16).for_each(|(y, shares)| {
-            for (x, (share, &belief)) in shares.iter_mut().zip(canvas.belief.row(y)).enumerate() {
-                *share = if belief <= PLAIN {
-                    0
-                } else {
-                    match share_of(scene, canvas, settings, x, y) {
-                        share if share < LEAST_SHARE => TISSUE,
-                        share => (255.0 * share + 0.5) as u8,
-                    }
-                };
+            shares.fill(0);
+            for (left, shares) in (0..).step_by(LANES).zip(shares.chunks_mut(LANES)) {
+                let believed = &canvas.belief.row(y)[left..left + shares.len()];
+                if believed.iter().any(|&belief| belief > PLAIN) {
+                    wide::run(Decide {
+                        scene,
+                        canvas,
+                        settings,
+                        place: (left, y),
+                        shares,
+                    });
+                }
             }
         });
         self.look_around();
@@ -115,17 +121,21 @@ impl wide::Kernel for MostAround<'_> {
 /// What was decided, and the blocks of the reduced picture where anything was.
 #[derive(Clone, Copy, Debug)]
 pub struct Decision<'a> {
+    /// The picture as it was.
+    pub picture: &'a Image<Rgb8>,
+    /// 255 where the lamp was detected.
+    pub specular: &'a Mask,
     /// The new colours.
     pub canvas: &'a Canvas,
     /// How much goes.
     pub shares: &'a Shares,
-    /// Picture pixels along a reduced pixel.
+    /// Picture pixels along a pixel that was looked at.
     pub step: usize,
-    /// Of the reduced picture.
+    /// Of the picture that was looked at.
     pub grid: Grid,
     /// 1 for every block with something to replace.
     pub blocks: &'a [u8],
-    /// 255 where nothing may be touched, in the picture itself.
+    /// 255 where nothing may be touched.
     pub forbidden: &'a Mask,
 }
 
@@ -147,6 +157,13 @@ pub fn replace(decision: &Decision<'_>, planes: Planes<'_>) {
                 view,
                 confidence,
             };
+            // Strip by strip the picture stays in the cache from one step to the next.
+            let first = strip.top * width;
+            strip
+                .image
+                .copy_from_slice(&decision.picture.pixels()[first..first + strip.image.len()]);
+            let seen = (decision.specular, Some(&decision.shares.own));
+            mark_left(seen, decision.step, (strip.top, width), strip.code);
             let blocks = &decision.blocks[j * across..(j + 1) * across];
             for i in (0..across).filter(|&i| blocks[i] != 0) {
                 decision.replace_block(i, j, &mut strip);
@@ -164,167 +181,243 @@ struct Strip<'a> {
     confidence: &'a mut [u8],
 }
 
-/// Sums of colours times what they replace, and of that.
-type Weighted = [f32; 4];
+/// So many reduced pixels of a row are carried back at a time …
+const LANES: usize = 16;
+/// … with one more at each side.
+const WITH_SIDES: usize = LANES + 2;
 
 impl Decision<'_> {
     fn replace_block(&self, i: usize, j: usize, strip: &mut Strip<'_>) {
         let (width, height) = self.shares.own.size();
         let side = self.grid.block();
+        let right = ((i + 1) * side).min(width);
         for row in j * side..((j + 1) * side).min(height) {
-            let (own, around) = (self.shares.own.row(row), self.shares.around.row(row));
-            for column in i * side..((i + 1) * side).min(width) {
-                if around[column] == 0 {
-                    continue;
+            for left in (i * side..right).step_by(LANES) {
+                let columns = left..(left + LANES).min(right);
+                if self.shares.around.row(row)[columns.clone()].iter().any(|&most| most > TISSUE) {
+                    wide::run(Carry {
+                        decision: self,
+                        columns,
+                        row,
+                        strip,
+                    });
                 }
-                let pixel = row * width + column;
-                if self.step > 1 && around[column] > TISSUE {
-                    self.replace_square(column, row, strip);
-                } else if own[column] > TISSUE {
-                    let color = self.canvas.color.pixels()[pixel].map(f32::from);
-                    self.put(strip, (column, row), pixel, f32::from(own[column]) / 255.0, color);
-                } else if own[column] == TISSUE {
-                    for place in self.square(column, row, strip) {
-                        self.acquit(strip, place);
+            }
+        }
+    }
+
+    /// Where a pixel of the picture lies from the middle of its reduced pixel: by how much, and the lane on that side, counted from the
+    /// one before.
+    #[inline(always)]
+    fn aside(&self, at: usize) -> (usize, f32) {
+        let off = (at as i32 as f32 + 0.5) / self.step as f32 - 0.5;
+        (if off < 0.0 { 0 } else { 2 }, off.abs())
+    }
+
+    /// The reduced pixel of which a replaced pixel has its origin: its own, or where that is not replaced the neighbour that counts most.
+    fn origin(&self, column: usize, row: usize) -> usize {
+        let own = &self.shares.own;
+        let (width, height) = own.size();
+        if own.at(column, row) > TISSUE {
+            return row * width + column;
+        }
+        let (mut most, mut origin) = (0, row * width + column);
+        for y in row.saturating_sub(1)..(row + 2).min(height) {
+            for x in column.saturating_sub(1)..(column + 2).min(width) {
+                if own.at(x, y) > most {
+                    (most, origin) = (own.at(x, y), y * width + x);
+                }
+            }
+        }
+        origin
+    }
+}
+
+/// Some reduced pixels of a row, carried to the pixels of the picture: linear between each and those around.
+struct Carry<'a, 'b, 'c> {
+    decision: &'a Decision<'b>,
+    columns: Range<usize>,
+    row: usize,
+    strip: &'a mut Strip<'c>,
+}
+
+impl wide::Kernel for Carry<'_, '_, '_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self {
+            decision,
+            columns,
+            row,
+            strip,
+        } = self;
+        let own = &decision.shares.own;
+        let (width, height) = own.size();
+        let forbidden = &decision.forbidden.row(row)[columns.clone()];
+        // Colours times what they replace, and that; of the row before, this one and the next.
+        let mut rows = [[[0.0_f32; WITH_SIDES]; 4]; 3];
+        for (planes, row) in rows.iter_mut().zip([row.saturating_sub(1), row, (row + 1).min(height - 1)]) {
+            let (shares, colors) = (own.row(row), decision.canvas.color.row(row));
+            for lane in 0..columns.len() + 2 {
+                let column = (columns.start + lane).saturating_sub(1).min(width - 1);
+                if shares[column] > TISSUE {
+                    let (share, [r, g, b]) = (f32::from(shares[column]), colors[column]);
+                    planes[0][lane] = share * f32::from(r);
+                    planes[1][lane] = share * f32::from(g);
+                    planes[2][lane] = share * f32::from(b);
+                    planes[3][lane] = share;
+                }
+            }
+        }
+        let step = decision.step;
+        let below = strip.top + strip.image.len() / strip.width;
+        for (y, v) in (row * step..below).zip(0..step) {
+            let (side, t) = decision.aside(v);
+            let mut between = [[0.0_f32; WITH_SIDES]; 4];
+            for c in 0..4 {
+                for lane in 0..WITH_SIDES {
+                    between[c][lane] = rows[1][c][lane] + t * (rows[side][c][lane] - rows[1][c][lane]);
+                }
+            }
+            for u in 0..step {
+                let (side, t) = decision.aside(u);
+                let mut mixed = [[0.0_f32; LANES]; 4];
+                for c in 0..4 {
+                    for lane in 0..LANES {
+                        mixed[c][lane] = between[c][lane + 1] + t * (between[c][lane + side] - between[c][lane + 1]);
                     }
                 }
-            }
-        }
-    }
-
-    /// The pixels of a reduced one.
-    #[inline(always)]
-    fn square(&self, column: usize, row: usize, strip: &Strip<'_>) -> impl Iterator<Item = (usize, usize)> + use<> {
-        let (step, bottom) = (self.step, strip.top + strip.image.len() / strip.width);
-        let (columns, rows) = (
-            column * step..((column + 1) * step).min(strip.width),
-            row * step..((row + 1) * step).min(bottom),
-        );
-        rows.flat_map(move |y| columns.clone().map(move |x| (x, y)))
-    }
-
-    /// The pixels of a reduced one, linear between it and those around.
-    fn replace_square(&self, column: usize, row: usize, strip: &mut Strip<'_>) {
-        let (shares, colors) = (self.shares.own.pixels(), self.canvas.color.pixels());
-        let (width, height) = self.shares.own.size();
-        let columns = [column.saturating_sub(1), column, (column + 1).min(width - 1)];
-        let rows = [row.saturating_sub(1), row, (row + 1).min(height - 1)].map(|row| row * width);
-        let mut around = [[[0.0_f32; 4]; 3]; 3];
-        for (around, row) in around.iter_mut().zip(rows) {
-            for (weighted, column) in around.iter_mut().zip(columns) {
-                let (share, [r, g, b]) = (shares[row + column], colors[row + column]);
-                if share > TISSUE {
-                    let share = f32::from(share);
-                    *weighted = [share * f32::from(r), share * f32::from(g), share * f32::from(b), share];
+                let left = columns.start * step + u;
+                let count = strip.width.saturating_sub(left).div_ceil(step).min(columns.len());
+                if count == 0 {
+                    continue;
+                }
+                let first = (y - strip.top) * strip.width + left;
+                let line = &mut strip.image[first..first + (count - 1) * step + 1];
+                let mut old = [[0.0_f32; LANES]; 3];
+                for lane in 0..count {
+                    for c in 0..3 {
+                        old[c][lane] = f32::from(line[lane * step][c]);
+                    }
+                }
+                let mut new = [[0_u8; LANES]; 3];
+                for c in 0..3 {
+                    for lane in 0..LANES {
+                        let more = (mixed[c][lane] - mixed[3][lane] * old[c][lane]) * (1.0 / 255.0);
+                        new[c][lane] = (old[c][lane] + more + 0.5) as i32 as u8;
+                    }
+                }
+                for lane in 0..count {
+                    if mixed[3][lane] < 255.0 * LEAST_SHARE || forbidden[lane] != 0 {
+                        continue;
+                    }
+                    line[lane * step] = [new[0][lane], new[1][lane], new[2][lane]];
+                    let (index, origin) = (first + lane * step, decision.origin(columns.start + lane, row));
+                    strip.code[index] = provenance_code::LIGHT_FIELD;
+                    strip.view[index] = decision.canvas.source.pixels()[origin];
+                    strip.confidence[index] = decision.canvas.belief.pixels()[origin];
                 }
             }
-        }
-        // A reduced pixel that is not replaced itself takes its origin from the neighbour that counts most.
-        let mut origin = (1, 1);
-        if around[1][1][3] == 0.0 {
-            for place in [(0, 1), (1, 0), (1, 2), (2, 1), (0, 0), (0, 2), (2, 0), (2, 2)] {
-                if around[place.0][place.1][3] > around[origin.0][origin.1][3] {
-                    origin = place;
-                }
-            }
-        }
-        let origin = rows[origin.0] + columns[origin.1];
-        let inverse = 1.0 / self.step as f32;
-        for (x, y) in self.square(column, row, strip) {
-            // Where the pixel's middle lies from that of the reduced one, and which neighbour is on that side.
-            let aside = |at: usize| {
-                let off = (at as i32 as f32 + 0.5) * inverse - 0.5;
-                (if off < 0.0 { 0 } else { 2 }, off.abs())
-            };
-            let ((i, fx), (j, fy)) = (aside(x - column * self.step), aside(y - row * self.step));
-            let level = mixed(&around[1][1], &around[1][i], fx);
-            let aside = mixed(&around[j][1], &around[j][i], fx);
-            let [r, g, b, share] = mixed(&level, &aside, fy);
-            if share >= 255.0 * LEAST_SHARE {
-                let inverse = 1.0 / share;
-                self.put(
-                    strip,
-                    (x, y),
-                    origin,
-                    share * (1.0 / 255.0),
-                    [r * inverse, g * inverse, b * inverse],
-                );
-            } else if shares[rows[1] + column] != 0 {
-                self.acquit(strip, (x, y));
-            }
-        }
-    }
-
-    /// Replace a pixel of the picture.
-    #[inline(always)]
-    fn put(&self, strip: &mut Strip<'_>, (x, y): (usize, usize), origin: usize, share: f32, color: [f32; 3]) {
-        if self.forbidden.at(x, y) != 0 {
-            return;
-        }
-        let index = (y - strip.top) * strip.width + x;
-        for (old, new) in strip.image[index].iter_mut().zip(color) {
-            let before = f32::from(*old);
-            *old = (before + share * (new - before) + 0.5) as i32 as u8;
-        }
-        strip.code[index] = provenance_code::LIGHT_FIELD;
-        strip.view[index] = self.canvas.source.pixels()[origin];
-        strip.confidence[index] = self.canvas.belief.pixels()[origin];
-    }
-
-    /// A pixel that was found to be tissue.
-    #[inline(always)]
-    fn acquit(&self, strip: &mut Strip<'_>, (x, y): (usize, usize)) {
-        if self.forbidden.at(x, y) == 0 {
-            strip.code[(y - strip.top) * strip.width + x] = provenance_code::UNTOUCHED;
         }
     }
 }
 
-/// How much of the old pixel goes, 0…1.
-fn share_of(scene: &Scene<'_>, canvas: &Canvas, settings: &Settings, x: usize, y: usize) -> f32 {
-    // Noise does not decide: the mean over 3 × 3 pixels.
-    let excess = mean_of_neighbours(canvas, x, y).max(0.6 * canvas.excess.at(x, y));
-    let near = (1.0 - f32::from(scene.distance.at(x, y)) / f32::from(scene.reach)).clamp(0.0, 1.0);
-    let against = if scene.distance.at(x, y) == 0 {
-        AGAINST_DETECTED
-    } else {
-        AGAINST_WEIGHT
-    };
-    let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + against * canvas.against[scene.grid.cell_at(x, y)];
-    let (low, high) = (settings.excess_low_levels + doubt, settings.excess_high_levels + doubt);
-    let brighter = ((excess - low) / (high - low)).clamp(0.0, 1.0);
-    smooth(brighter) * smooth((4.0 * near).min(1.0))
+/// Fill the `codes` of a stretch of rows from row `top` on, `width` px wide: left is all of `specular`, of pixels `step` times as large,
+/// but what was looked at.
+pub fn mark_left((specular, looked_at): (&Mask, Option<&Mask>), step: usize, (top, width): (usize, usize), codes: &mut [u8]) {
+    codes.fill(provenance_code::UNTOUCHED);
+    for (y, codes) in (top..).zip(codes.chunks_mut(width)) {
+        for run in set_runs(specular.row(y / step)) {
+            codes[run.start * step..(run.end * step).min(width)].fill(provenance_code::LEFT);
+        }
+        for run in looked_at.into_iter().flat_map(|looked_at| set_runs(looked_at.row(y / step))) {
+            codes[run.start * step..(run.end * step).min(width)].fill(provenance_code::UNTOUCHED);
+        }
+    }
+}
+
+/// How much of some pixels in a row goes.
+struct Decide<'a> {
+    scene: &'a Scene<'a>,
+    canvas: &'a Canvas,
+    settings: &'a Settings,
+    /// Column and row of the first.
+    place: (usize, usize),
+    shares: &'a mut [u8],
+}
+
+impl wide::Kernel for Decide<'_> {
+    #[inline(always)]
+    fn run(self) {
+        let Self {
+            scene,
+            canvas,
+            settings,
+            place: (left, y),
+            shares,
+        } = self;
+        let (width, height) = canvas.belief.size();
+        let columns = left..left + shares.len();
+        // Sums down three rows, one column more at each side.
+        let (mut sums, mut counts) = ([0.0_f32; WITH_SIDES], [0.0_f32; WITH_SIDES]);
+        let with_sides = left.saturating_sub(1)..(columns.end + 1).min(width);
+        let first = with_sides.start + 1 - left;
+        for v in y.saturating_sub(1)..(y + 2).min(height) {
+            let (beliefs, excesses) = (
+                &canvas.belief.row(v)[with_sides.clone()],
+                &canvas.excess.row(v)[with_sides.clone()],
+            );
+            let columns = sums[first..].iter_mut().zip(&mut counts[first..]);
+            for ((sum, count), (&belief, &excess)) in columns.zip(beliefs.iter().zip(excesses)) {
+                *sum += if belief > 0 { excess } else { 0.0 };
+                *count += if belief > 0 { 1.0 } else { 0.0 };
+            }
+        }
+        let (mut excess, mut distance, mut against) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+        for (lane, &own) in canvas.excess.row(y)[columns.clone()].iter().enumerate() {
+            excess[lane] = own;
+        }
+        for (lane, &from) in scene.distance.row(y)[columns.clone()].iter().enumerate() {
+            distance[lane] = f32::from(from);
+        }
+        for (lane, x) in columns.clone().enumerate() {
+            against[lane] = canvas.against[scene.grid.cell_at(x, y)];
+        }
+        let reach = 1.0 / f32::from(scene.reach);
+        let (low, range) = (
+            settings.excess_low_levels,
+            1.0 / (settings.excess_high_levels - settings.excess_low_levels),
+        );
+        let mut decided = [0_u8; LANES];
+        for lane in 0..LANES {
+            // Noise does not decide: the mean over 3 × 3 pixels.
+            let sum = sums[lane] + sums[lane + 1] + sums[lane + 2];
+            let count = (counts[lane] + counts[lane + 1] + counts[lane + 2]).max(1.0);
+            let excess = (sum / count).max(0.6 * excess[lane]);
+            let near = (1.0 - distance[lane] * reach).max(0.0);
+            let weight = if distance[lane] == 0.0 {
+                AGAINST_DETECTED
+            } else {
+                AGAINST_WEIGHT
+            };
+            let doubt = FAR_DOUBT_LEVELS * (1.0 - 2.0 * near).max(0.0) + weight * against[lane];
+            let brighter = ((excess - low - doubt) * range).clamp(0.0, 1.0);
+            let share = smooth(brighter) * smooth((4.0 * near).min(1.0));
+            decided[lane] = if share < LEAST_SHARE {
+                TISSUE
+            } else {
+                (255.0 * share + 0.5) as i32 as u8
+            };
+        }
+        let beliefs = &canvas.belief.row(y)[columns];
+        for ((share, &belief), &decided) in shares.iter_mut().zip(beliefs).zip(&decided) {
+            *share = if belief > PLAIN { decided } else { 0 };
+        }
+    }
 }
 
 #[inline(always)]
-fn mixed(a: &Weighted, b: &Weighted, share: f32) -> Weighted {
-    let mut sum = [0.0; 4];
-    for i in 0..4 {
-        sum[i] = a[i] + share * (b[i] - a[i]);
-    }
-    sum
-}
-
 fn smooth(t: f32) -> f32 {
     t * t * (3.0 - 2.0 * t)
-}
-
-fn mean_of_neighbours(canvas: &Canvas, x: usize, y: usize) -> f32 {
-    let (width, height) = canvas.belief.size();
-    let (mut sum, mut count) = (0.0, 0.0);
-    for v in y.saturating_sub(1)..(y + 2).min(height) {
-        let columns = x.saturating_sub(1)..(x + 2).min(width);
-        for (&belief, &excess) in canvas.belief.row(v)[columns.clone()]
-            .iter()
-            .zip(&canvas.excess.row(v)[columns])
-        {
-            if belief > 0 {
-                sum += excess;
-                count += 1.0;
-            }
-        }
-    }
-    sum / f32::max(count, 1.0)
 }
 
 #[cfg(test)]
@@ -354,22 +447,25 @@ mod tests {
         for y in 0..height {
             for x in 0..width {
                 let far = (x as f32 - 48.0).hypot(y as f32 - 32.0);
-                shares.own.set(x, y, if far < 10.0 { 255 } else { u8::from(far < 14.0) });
+                let share = if far < 10.0 { 255 } else { u8::from(far < 14.0) };
+                shares.own.set(x, y, if x < forbidden_from { share } else { 0 });
             }
         }
         shares.look_around();
         // One pixel more than whole squares.
         let (full_width, full_height) = (step * width - usize::from(step > 1), step * height - usize::from(step > 1));
         let mut out = Replaced {
-            image: Image::filled(full_width, full_height, OLD),
-            code: Image::filled(full_width, full_height, provenance_code::LEFT),
+            image: Image::filled(full_width, full_height, [0; 3]),
+            code: Image::filled(full_width, full_height, 1),
             view: Image::filled(full_width, full_height, 0),
         };
-        let mut forbidden = Image::filled(full_width, full_height, 0);
-        for y in 0..full_height {
-            forbidden.row_mut(y)[forbidden_from.min(full_width)..].fill(255);
+        let mut forbidden = Image::filled(width, height, 0);
+        for y in 0..height {
+            forbidden.row_mut(y)[forbidden_from.min(width)..].fill(255);
         }
         let decision = Decision {
+            picture: &Image::filled(full_width, full_height, OLD),
+            specular: &Image::filled(width, height, 255),
             canvas: &canvas,
             shares: &shares,
             step,
@@ -415,10 +511,10 @@ mod tests {
     }
 
     #[test]
-    fn what_is_forbidden_in_the_picture_stays_to_the_pixel() {
+    fn what_is_forbidden_stays_to_the_pixel() {
         for step in [1, 2, 3] {
-            let border = 48 * step + 1;
-            let out = replaced(step, border);
+            let out = replaced(step, 49);
+            let border = 49 * step;
             for y in 0..out.image.height() {
                 assert!(out.image.row(y)[border..].iter().all(|&pixel| pixel == OLD));
                 assert!(out.code.row(y)[border..].iter().all(|&code| code == provenance_code::LEFT));

@@ -6,7 +6,7 @@ use crossbeam::queue::ArrayQueue;
 use rayon::prelude::*;
 
 use crate::camera::model::CameraModel;
-use crate::frame::{Frame, Provenance, provenance_code};
+use crate::frame::{Analysis, Frame, Provenance};
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::chamfer_distance;
 use crate::image::pool::Pool;
@@ -18,8 +18,7 @@ use crate::stages::specularity_substitution::camera_blending::CameraBlending;
 use crate::stages::specularity_substitution::drawing::Chosen;
 use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::live::Live;
-use crate::stages::specularity_substitution::reduced::{Reduced, mean_of_squares, reduced_camera, reduction_for};
-use crate::stages::specularity_substitution::replacement::{Decision, Planes, Shares, replace};
+use crate::stages::specularity_substitution::replacement::{Decision, Planes, Shares, mark_left, replace};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 use crate::stages::specularity_substitution::sight::{Vantage, Views};
@@ -31,7 +30,7 @@ use crate::stages::specularity_substitution::view_fit::{Comparison, Statistics, 
 #[derive(Debug)]
 struct Cameras {
     of_picture: CameraModel,
-    /// Of the reduced picture.
+    /// Of the picture that is looked at.
     reduced: CameraModel,
     /// Of the depth's picture.
     of_depth: CameraModel,
@@ -39,7 +38,7 @@ struct Cameras {
 
 impl Cameras {
     fn new(camera: &CameraModel, step: usize) -> Self {
-        let reduced = reduced_camera(camera, step);
+        let reduced = camera.reduced(step);
         Self {
             of_picture: camera.clone(),
             of_depth: reduced.scaled(1.0 / depth_step(reduced.width) as f64),
@@ -56,7 +55,6 @@ pub struct SpecularitySubstitution {
     small_views: Vec<SmallView>,
     surface: SurfaceDepth,
     cameras: Option<Cameras>,
-    reduced: Reduced,
     distance: Image<u16>,
     forbidden: Mask,
     vantages: Vec<Option<Vantage>>,
@@ -85,7 +83,6 @@ impl SpecularitySubstitution {
             small_views,
             surface: SurfaceDepth::default(),
             cameras: None,
-            reduced: Reduced::default(),
             distance: Image::filled(0, 0, 0),
             forbidden: Image::filled(0, 0, 0),
             vantages: Vec::new(),
@@ -101,68 +98,54 @@ impl SpecularitySubstitution {
         }
     }
 
-    /// Where nothing may be touched or learnt.
-    fn find_forbidden(&mut self, frame: &Frame) {
-        match &frame.instruments {
-            Some(instruments) => self.forbidden.copy_from(instruments),
-            None => {
-                let (width, height) = frame.image.size();
-                self.forbidden.resize(width, height, 0);
-                self.forbidden.fill(0);
-            }
+    /// Provenance of a picture, still to be filled.
+    fn take_planes(&self, (width, height): (usize, usize)) -> Provenance {
+        Provenance {
+            code: self.codes.take(width, height),
+            view: self.views.take(width, height),
+            confidence: self.codes.take(width, height),
         }
-        if let Some(field) = &frame.field_of_view {
+    }
+
+    /// Where nothing may be touched or learnt.
+    fn find_forbidden(&mut self, analysis: &Analysis) {
+        self.forbidden.copy_from(&analysis.instruments);
+        if let Some(field) = &analysis.field_of_view {
             for (forbidden, &inside) in self.forbidden.pixels_mut().iter_mut().zip(field.pixels()) {
                 *forbidden |= 255 - inside;
             }
         }
     }
 
-    fn substitute(&mut self, frame: &mut Frame, specular: &Mask, light_field: &LightField, camera: &CameraModel) {
-        let step = reduction_for(camera.width);
-        self.find_forbidden(frame);
+    fn substitute(&mut self, frame: &mut Frame, analysis: &Analysis, light_field: &LightField, camera: &CameraModel) {
+        let step = analysis.step;
+        self.find_forbidden(analysis);
         if self.cameras.as_ref().is_none_or(|cameras| cameras.of_picture != *camera) {
             self.cameras = Some(Cameras::new(camera, step));
         }
         let (Some(eye), Some(cameras)) = (&frame.world_from_camera, &self.cameras) else {
             return;
         };
-        if step > 1 {
-            self.reduced.take_masks(step, specular, &self.forbidden);
-        }
-        let (marked, forbidden) = if step > 1 {
-            (&self.reduced.specular, &self.reduced.forbidden)
-        } else {
-            (specular, &self.forbidden)
-        };
-        let scale = marked.width() as f32 / REFERENCE_WIDTH_PX;
+        let image = analysis.image(&frame.image);
+        let scale = image.width() as f32 / REFERENCE_WIDTH_PX;
         let settings = &self.settings;
         let reach = Scene::distance_of((settings.reach_px * scale).max(2.0));
         let ring = reach + Scene::distance_of((settings.margin_px * scale).max(6.0));
-        let (surface, distance, reduced, out) = (&mut self.surface, &mut self.distance, &mut self.reduced.image, &mut self.out);
-        let (codes, views) = (&self.codes, &self.views);
-        let (_, mut provenance) = rayon::join(
+        let (surface, distance) = (&mut self.surface, &mut self.distance);
+        rayon::join(
             || surface.draw(light_field, &cameras.of_depth, eye),
-            || {
-                chamfer_distance(marked, ring + 1, distance);
-                if step > 1 {
-                    mean_of_squares(&frame.image, step, (distance, ring), reduced);
-                }
-                out.copy_from(&frame.image);
-                all_left(codes, views, specular)
-            },
+            || chamfer_distance(&analysis.specularities, ring + 1, distance),
         );
-        let image = if step > 1 { &self.reduced.image } else { &*frame.image };
         let camera = &cameras.reduced;
         let scene = Scene {
             light_field,
             image,
             depth: &self.surface.depth,
             distance: &self.distance,
-            forbidden,
+            forbidden: &self.forbidden,
             depth_step: Division::by(depth_step(camera.width)),
             scale,
-            grid: Grid::over(marked.size()),
+            grid: Grid::over(image.size()),
             reach,
             guard: Scene::distance_of(self.settings.guard_px * scale),
             ring,
@@ -207,6 +190,11 @@ impl SpecularitySubstitution {
             vantages: &self.vantages,
         };
         self.canvas.draw(&scene, &self.live, &chosen);
+        let (width, height) = frame.image.size();
+        if self.out.size() != (width, height) {
+            self.out.resize(width, height, [0; 3]);
+        }
+        let mut provenance = self.take_planes((width, height));
         let planes = Planes {
             image: &mut self.out,
             code: &mut provenance.code,
@@ -215,6 +203,8 @@ impl SpecularitySubstitution {
         };
         self.shares.decide(&scene, &self.canvas, &self.settings);
         let decision = Decision {
+            picture: &frame.image,
+            specular: &analysis.specularities,
             canvas: &self.canvas,
             shares: &self.shares,
             step,
@@ -259,30 +249,13 @@ fn mean_brightness(live: &Live) -> f32 {
     sum / weight.max(1e-6)
 }
 
-/// Every specularity left as it was.
-fn all_left(codes: &Pool<u8>, views: &Pool<u16>, specular: &Mask) -> Provenance {
-    let (width, height) = specular.size();
-    let mut code = codes.take_copy(specular);
-    for value in code.pixels_mut() {
-        *value = if *value != 0 {
-            provenance_code::LEFT
-        } else {
-            provenance_code::UNTOUCHED
-        };
-    }
-    let (mut view, mut confidence) = (views.take(width, height), codes.take(width, height));
-    view.fill(0);
-    confidence.fill(0);
-    Provenance { code, view, confidence }
-}
-
 impl Stage for SpecularitySubstitution {
     fn name(&self) -> &'static str {
         "specularity_substitution"
     }
 
     fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
-        let Some(specular) = frame.specularities.take() else {
+        let Some(analysis) = frame.analysis.take() else {
             return Err(StageError(
                 "no specularity mask: the detection stage must run before the substitution".into(),
             ));
@@ -293,15 +266,23 @@ impl Stage for SpecularitySubstitution {
         let light_field = self.light_field.clone();
         let aligned = frame.alignment.is_some_and(|a| a.aligned) && frame.world_from_camera.is_some();
         match (light_field, frame.camera.clone()) {
-            (Some(light_field), Some(camera)) if aligned && specular.size() == frame.image.size() => {
-                self.substitute(frame, &specular, &light_field, &camera);
+            (Some(light_field), Some(camera)) if aligned => {
+                self.substitute(frame, &analysis, &light_field, &camera);
             }
             _ => {
                 self.reset();
-                frame.provenance = Some(all_left(&self.codes, &self.views, &specular));
+                let mut provenance = self.take_planes(frame.image.size());
+                let codes = provenance.code.pixels_mut();
+                mark_left(
+                    (&analysis.specularities, None),
+                    analysis.step,
+                    (0, frame.image.width()),
+                    codes,
+                );
+                frame.provenance = Some(provenance);
             }
         }
-        frame.specularities = Some(specular);
+        frame.analysis = Some(analysis);
         Ok(())
     }
 
