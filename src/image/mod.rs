@@ -15,5 +15,6 @@ pub mod pyramid;
 pub mod remap;
 mod remap_bicubic;
 mod remap_bilinear;
+mod remap_octets;
 pub mod specularity;
 pub mod wide;
