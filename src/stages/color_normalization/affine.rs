@@ -125,12 +125,11 @@ impl Kernel for AffineRun<'_> {
         let (sources, rest) = source.as_chunks::<CHUNK>();
         let (targets, rest_target) = target.as_chunks_mut::<CHUNK>();
         for (source, target) in sources.iter().zip(targets) {
-            chunk(&map, source, target);
+            *target = chunk(&map, source);
         }
-        let (mut padded, mut padded_target) = ([[0; 3]; CHUNK], [[0; 3]; CHUNK]);
+        let mut padded = [[0; 3]; CHUNK];
         padded[..rest.len()].copy_from_slice(rest);
-        chunk(&map, &padded, &mut padded_target);
-        rest_target.copy_from_slice(&padded_target[..rest.len()]);
+        rest_target.copy_from_slice(&chunk(&map, &padded)[..rest.len()]);
         if !field_of_view.is_empty() {
             keep_surround(source, target, field_of_view);
         }
@@ -155,49 +154,24 @@ fn byte_from(value: f32) -> u8 {
     (value.clamp(0.0, 255.0) + INTEGER_BITS).to_bits() as u8
 }
 
-/// The length is fixed and known, so that nothing is left over for a loop over single pixels. Most chunks have neither black nor
-/// clipped pixels: all weights are 1. Otherwise they are found in integers, in 1/256, and are the same to the last bit.
+/// The length is fixed and known, so that nothing is left over for a loop over single pixels.
 #[inline(always)]
-fn chunk(map: &Affine, source: &[Rgb8; CHUNK], target: &mut [Rgb8; CHUNK]) {
-    const RAMP: u8 = RAMP_LEVELS as u8;
-    let mut planes = [[0_u8; CHUNK]; 3];
-    let [red, green, blue] = &mut planes;
+fn chunk(map: &Affine, source: &[Rgb8; CHUNK]) -> [Rgb8; CHUNK] {
+    let (mut red, mut green, mut blue) = ([0_u8; CHUNK], [0_u8; CHUNK], [0_u8; CHUNK]);
     for i in 0..CHUNK {
         [red[i], green[i], blue[i]] = source[i];
     }
-    let (mut lit, mut unclipped) = ([0_u8; CHUNK], [0_u8; CHUNK]);
-    let mut least = RAMP;
     for i in 0..CHUNK {
-        lit[i] = red[i].max(green[i]).max(blue[i]).saturating_sub(BLACK_LEVEL as u8).min(RAMP);
-        unclipped[i] = (WHITE_LEVEL as u8)
-            .saturating_sub(red[i].min(green[i]).min(blue[i]))
-            .min(RAMP);
-        least = least.min(lit[i]).min(unclipped[i]);
+        let [r, g, b] = map.apply_blended([f32::from(red[i]), f32::from(green[i]), f32::from(blue[i])]);
+        red[i] = byte_from(r);
+        green[i] = byte_from(g);
+        blue[i] = byte_from(b);
     }
-    if least == RAMP {
-        for i in 0..CHUNK {
-            change(map, &mut planes, i, 1.0);
-        }
-    } else {
-        for i in 0..CHUNK {
-            let weight = u16::from(lit[i]) * u16::from(unclipped[i]);
-            change(map, &mut planes, i, f32::from(weight) * (1.0 / (RAMP_LEVELS * RAMP_LEVELS)));
-        }
-    }
-    let [red, green, blue] = &planes;
+    let mut target = [[0; 3]; CHUNK];
     for i in 0..CHUNK {
         target[i] = [red[i], green[i], blue[i]];
     }
-}
-
-/// [`Affine::apply_blended`] for pixel `i` of a chunk, of which the weight is known.
-#[inline(always)]
-fn change(map: &Affine, [red, green, blue]: &mut [[u8; CHUNK]; 3], i: usize, weight: f32) {
-    let color = [f32::from(red[i]), f32::from(green[i]), f32::from(blue[i])];
-    let [r, g, b] = map.apply(color);
-    red[i] = byte_from(color[0] + weight * (r - color[0]));
-    green[i] = byte_from(color[1] + weight * (g - color[1]));
-    blue[i] = byte_from(color[2] + weight * (b - color[2]));
+    target
 }
 
 #[cfg(test)]
@@ -214,11 +188,7 @@ mod tests {
             Matrix3::new(0.87, 0.05, -0.02, 0.01, 1.04, 0.0, -0.03, 0.02, 1.27),
             Vector3::new(4.0, -6.0, 9.0),
         );
-        // The first chunks hold anything, the next only colors of weight 1.
         let mut source: Vec<Rgb8> = (0..1003).map(|_| random.random()).collect();
-        for pixel in &mut source[3 * CHUNK..6 * CHUNK] {
-            *pixel = [random.random_range(26..=255), random.random(), random.random_range(0..=238)];
-        }
         source[7] = [255; 3];
         source[8] = [10, 3, 0];
         source[9] = [0; 3];
