@@ -16,5 +16,6 @@ pub mod reduction;
 pub mod remap;
 mod remap_bicubic;
 mod remap_bilinear;
+mod remap_octets;
 pub mod specularity;
 pub mod wide;

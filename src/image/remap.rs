@@ -5,11 +5,13 @@
 //!
 //! The table is read once per pixel and frame, so it is small: 32 bits a pixel, 22 of them the source pixel counted from a base
 //! that each block of 64 output pixels has to itself, 10 of them the fractions. A pixel whose four neighbours are not all in the
-//! source stands in a short list of its own, so that the loop over the others need not look at borders.
+//! source stands in a short list of its own, so that the loop over the others need not look at borders. A second table says the same
+//! for eight output pixels at once in 24 bytes: see [`crate::image::remap_octets`].
 
 use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Mask, Rgb8};
+use crate::image::remap_octets::{EIGHT, Octet};
 use crate::image::{remap_bicubic, remap_bilinear};
 
 /// Fractions of a pixel that positions are rounded to, as in OpenCV.
@@ -83,6 +85,9 @@ pub struct RemapTable {
     entries: Vec<u32>,
     /// Smallest source pixel of each block, row by row.
     bases: Vec<u32>,
+    /// The same for every eight output pixels of a row that are together, row by row: all that [`Interpolation::Bilinear`] reads where
+    /// the map is smooth.
+    octets: Vec<Octet>,
     /// Output pixels at the source's border, in order.
     edges: Vec<(u32, Place)>,
 }
@@ -113,11 +118,13 @@ impl RemapTable {
             source_height,
             entries: Vec::new(),
             bases: Vec::new(),
+            octets: Vec::new(),
             edges: Vec::new(),
         };
         for (y, row) in rows?.into_iter().enumerate() {
             table.entries.extend(row.entries);
             table.bases.extend(row.bases);
+            table.octets.extend(row.octets);
             table
                 .edges
                 .extend(row.edges.into_iter().map(|(x, place)| ((y * width + x) as u32, place)));
@@ -178,14 +185,19 @@ impl RemapTable {
         if out.size() != self.size() {
             out.resize(self.width, self.height, [0; 3]);
         }
-        let row_kernel: RowKernel = match interpolation {
-            Interpolation::Nearest => nearest_row,
-            Interpolation::Bilinear => remap_bilinear::row_kernel(),
-            Interpolation::Bicubic => remap_bicubic::row_kernel(),
-        };
-        self.each_row(out.pixels_mut(), |entries, bases, row| {
-            row_kernel(entries, bases, source, row)
-        });
+        match interpolation {
+            Interpolation::Nearest => self.each_row(out.pixels_mut(), |row, out| {
+                nearest_row(row.entries, row.bases, source, out);
+            }),
+            Interpolation::Bilinear => {
+                let kernel = remap_bilinear::row_kernel();
+                self.each_row(out.pixels_mut(), |row, out| kernel(&row, source, out));
+            }
+            Interpolation::Bicubic => {
+                let kernel = remap_bicubic::row_kernel();
+                self.each_row(out.pixels_mut(), |row, out| kernel(row.entries, row.bases, source, out));
+            }
+        }
         let edge_kernel: fn(&Image<Rgb8>, Place) -> Rgb8 = match interpolation {
             Interpolation::Nearest => |image, place| nearest_at(image, place).unwrap_or([0; 3]),
             Interpolation::Bilinear => bilinear_at,
@@ -205,11 +217,11 @@ impl RemapTable {
             out.resize(self.width, self.height, 0);
         }
         let nearest = interpolation == Interpolation::Nearest;
-        self.each_row(out.pixels_mut(), |entries, bases, row| {
+        self.each_row(out.pixels_mut(), |row, out| {
             if nearest {
-                nearest_row(entries, bases, source, row)
+                nearest_row(row.entries, row.bases, source, out)
             } else {
-                mask_bilinear_row(entries, bases, source, row)
+                mask_bilinear_row(row.entries, row.bases, source, out)
             }
         });
         let pixels = out.pixels_mut();
@@ -224,21 +236,35 @@ impl RemapTable {
         Ok(())
     }
 
-    fn each_row<P: Send>(&self, out: &mut [P], kernel: impl Fn(&[u32], &[u32], &mut [P]) + Sync) {
-        let blocks = self.width.div_ceil(BLOCK);
+    fn each_row<P: Send>(&self, out: &mut [P], kernel: impl Fn(Row<'_>, &mut [P]) + Sync) {
         out.par_chunks_mut(self.width * ROWS_PER_BAND)
-            .zip(self.entries.par_chunks(self.width * ROWS_PER_BAND))
-            .zip(self.bases.par_chunks(blocks * ROWS_PER_BAND))
-            .for_each(|((out, entries), bases)| {
-                let rows = out
-                    .chunks_mut(self.width)
-                    .zip(entries.chunks(self.width))
-                    .zip(bases.chunks(blocks));
-                for ((row, entries), bases) in rows {
-                    kernel(entries, bases, row);
+            .enumerate()
+            .for_each(|(band, out)| {
+                for (y, out) in out.chunks_mut(self.width).enumerate() {
+                    kernel(self.row(band * ROWS_PER_BAND + y), out);
                 }
             });
     }
+
+    pub(crate) fn row(&self, y: usize) -> Row<'_> {
+        let (blocks, octets) = (self.width.div_ceil(BLOCK), self.width / EIGHT);
+        Row {
+            entries: &self.entries[y * self.width..(y + 1) * self.width],
+            bases: &self.bases[y * blocks..(y + 1) * blocks],
+            octets: &self.octets[y * octets..(y + 1) * octets],
+        }
+    }
+}
+
+/// What a table says about one output row.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Row<'a> {
+    /// One a pixel.
+    pub entries: &'a [u32],
+    /// One a block.
+    pub bases: &'a [u32],
+    /// One for every eight pixels; none for the rest.
+    pub octets: &'a [Octet],
 }
 
 fn place_of((x, y): (f64, f64)) -> Option<Place> {
@@ -257,6 +283,7 @@ fn place_of((x, y): (f64, f64)) -> Option<Place> {
 struct RowOfTable {
     entries: Vec<u32>,
     bases: Vec<u32>,
+    octets: Vec<Octet>,
     edges: Vec<(usize, Place)>,
 }
 
@@ -265,16 +292,20 @@ impl RowOfTable {
         let mut row = Self {
             entries: Vec::with_capacity(places.len()),
             bases: Vec::new(),
+            octets: Vec::new(),
             edges: Vec::new(),
         };
         let (last_x, last_y) = (source_width as i32 - 1, source_height as i32 - 1);
+        // Eight bytes are read at each of two rows for two pixels of three bytes: the last such pair has no room for that.
+        let inner = |p: &Place| {
+            let inside = p.x >= 0 && p.y >= 0 && p.x < last_x && p.y < last_y;
+            inside && (p.x + 1 < last_x || p.y + 1 < last_y)
+        };
+        let eights = places.as_chunks::<EIGHT>().0.iter();
+        row.octets
+            .extend(eights.map(|eight| Octet::new(eight, (source_width, source_height), inner)));
         for (block_number, block) in places.chunks(BLOCK).enumerate() {
             let pixel = |place: &Place| (place.y as usize * source_width + place.x as usize) as u32;
-            // Eight bytes are read at each of two rows for two pixels of three bytes: the last such pair has no room for that.
-            let inner = |p: &Place| {
-                let inside = p.x >= 0 && p.y >= 0 && p.x < last_x && p.y < last_y;
-                inside && (p.x + 1 < last_x || p.y + 1 < last_y)
-            };
             let base = block
                 .iter()
                 .flatten()

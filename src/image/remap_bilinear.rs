@@ -2,10 +2,14 @@
 //!
 //! For one output pixel the AVX2 kernel puts the eight bytes from the upper row (two pixels and a bit) and the eight from the
 //! lower row side by side, shuffles them to r₀₀ r₁₀ r₀₁ r₁₁ g₀₀ …, multiplies and adds neighbours with (32−fx, fx)
-//! (`pmaddubsw`), then with (32−fy, fy) (`pmaddwd`): three exact sums in 1/1024. Two output pixels share a register.
+//! (`pmaddubsw`), then with (32−fy, fy) (`pmaddwd`): three exact sums in 1/1024. Two output pixels share a register. It takes any map;
+//! where eight pixels lie as a lens has them, [`crate::image::remap_octets`] is half as fast again and goes first.
 
 use crate::image::buffer::{Image, Rgb8};
-use crate::image::remap::{BLOCK, OUTSIDE, RowKernel, blend, pair, unpacked};
+use crate::image::remap::{BLOCK, OUTSIDE, Row, blend, pair, unpacked};
+
+/// Fills one output row from what the table says about it and the source.
+pub(crate) type RowKernel = fn(&Row<'_>, &Image<Rgb8>, &mut [Rgb8]);
 
 /// The fastest kernel for this machine.
 pub(crate) fn row_kernel() -> RowKernel {
@@ -17,8 +21,8 @@ pub(crate) fn row_kernel() -> RowKernel {
 }
 
 /// One output row, any machine.
-pub(crate) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
-    for ((entries, out), base) in entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(bases) {
+fn row(row: &Row<'_>, source: &Image<Rgb8>, out: &mut [Rgb8]) {
+    for ((entries, out), base) in row.entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(row.bases) {
         for (entry, out) in entries.iter().zip(out) {
             *out = pixel(*entry, *base, source);
         }
@@ -49,28 +53,45 @@ mod avx2 {
     };
 
     use crate::image::buffer::{Image, Rgb8};
-    use crate::image::remap::{BLOCK, FRACTION_BITS};
+    use crate::image::remap::{BLOCK, FRACTION_BITS, Row};
+    use crate::image::remap_octets::EIGHT;
+    use crate::image::remap_octets::avx2::Rows;
 
-    pub(super) fn row(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
+    pub(super) fn row(row: &Row<'_>, source: &Image<Rgb8>, out: &mut [Rgb8]) {
         #[expect(unsafe_code, reason = "AVX2 makes the remap of a 1080p frame several times faster")]
         // SAFETY: `row_kernel` hands this function out only where the machine has AVX2.
         unsafe {
-            row_avx2(entries, bases, source, out);
+            row_avx2(row, source, out);
         }
     }
 
     #[target_feature(enable = "avx2")]
-    fn row_avx2(entries: &[u32], bases: &[u32], source: &Image<Rgb8>, out: &mut [Rgb8]) {
+    fn row_avx2(row: &Row<'_>, source: &Image<Rgb8>, out: &mut [Rgb8]) {
         let stride = 3 * source.width();
-        for ((entries, out), base) in entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(bases) {
-            let (octets, rest) = entries.as_chunks::<8>();
-            let (out_octets, out_rest) = out.as_chunks_mut::<8>();
-            let from_base = source.as_bytes().get(3 * *base as usize..).unwrap_or(&[]);
-            let block = Block::new(octets, from_base, stride);
-            for (octet, out) in octets.iter().zip(out_octets) {
+        let rows = Rows::new(source.as_bytes(), stride);
+        let mut smooth = row.octets.chunks(BLOCK / EIGHT);
+        for ((entries, out), base) in row.entries.chunks(BLOCK).zip(out.chunks_mut(BLOCK)).zip(row.bases) {
+            let (octets, rest) = entries.as_chunks::<EIGHT>();
+            let (out_octets, out_rest) = out.as_chunks_mut::<EIGHT>();
+            let smooth = smooth.next().unwrap_or(&[]);
+            let mut block = None;
+            for ((octet, smooth), out) in octets.iter().zip(smooth).zip(out_octets) {
+                if let Some(rows) = &rows
+                    && smooth.fill(rows, out)
+                {
+                    continue;
+                }
+                if block.is_none() {
+                    let from_base = source.as_bytes().get(3 * *base as usize..).unwrap_or(&[]);
+                    block = Block::new(octets, from_base, stride);
+                }
                 match &block {
                     Some(block) if all_inside(octet) => block.eight(octet, out),
-                    _ => *out = octet.map(|entry| super::pixel(entry, *base, source)),
+                    _ => {
+                        for (entry, out) in octet.iter().zip(out) {
+                            *out = super::pixel(*entry, *base, source);
+                        }
+                    }
                 }
             }
             for (entry, out) in rest.iter().zip(out_rest) {
@@ -196,6 +217,7 @@ mod avx2 {
 mod tests {
     use super::*;
     use crate::image::remap::{Interpolation, RemapTable};
+    use crate::image::remap_octets::{EIGHT, Octet};
     use rand::{RngExt as _, SeedableRng as _};
 
     fn noise(width: usize, height: usize, seed: u64) -> Image<Rgb8> {
@@ -264,8 +286,14 @@ mod tests {
             })
             .collect();
         let (mut plain, mut fast) = (vec![[1; 3]; 131], vec![[2; 3]; 131]);
-        row(&entries, &[5, 0, 70], &source, &mut plain);
-        row_kernel()(&entries, &[5, 0, 70], &source, &mut fast);
+        let nowhere = Octet::new(&[None; EIGHT], (131, 57), |_| true);
+        let what = Row {
+            entries: &entries,
+            bases: &[5, 0, 70],
+            octets: &[nowhere; 131 / EIGHT],
+        };
+        row(&what, &source, &mut plain);
+        row_kernel()(&what, &source, &mut fast);
         assert_eq!(plain, fast);
     }
 }

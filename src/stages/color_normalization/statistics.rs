@@ -10,6 +10,8 @@ use crate::image::buffer::{Image, Mask, Rgb8};
 
 /// Distance of the samples, px.
 const STEP: usize = 8;
+/// Samples treated together.
+const LANES: usize = 64;
 /// Darker than 5 % of full scale: surround or shadow.
 const MIN_LEVEL: f32 = 13.0;
 /// From here on a channel counts as clipped.
@@ -40,6 +42,81 @@ pub struct Measurement {
     pub instrument_share: f64,
 }
 
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Kind {
+    Other,
+    Steel,
+    Tissue,
+}
+
+/// Samples of a row: looked up one after the other without a question asked, then judged together.
+struct Samples {
+    /// Red, green, blue, corrected.
+    colors: [[f32; LANES]; 3],
+    /// In the image field, and not clipped.
+    usable: [bool; LANES],
+    instrument: [bool; LANES],
+}
+
+impl Samples {
+    /// The first `count` samples from (x, y) on; `inside` says by number which lie in the image field.
+    #[inline(always)]
+    fn gather(
+        image: &Image<Rgb8>,
+        (x, y): (usize, usize),
+        count: usize,
+        inside: impl Fn(usize) -> bool,
+        correct: impl Fn([f32; 3]) -> [f32; 3],
+    ) -> Self {
+        let (upper, lower) = (&image.row(y)[x..], &image.row(y + 1)[x..]);
+        let mut samples = Self {
+            colors: [[0.0; LANES]; 3],
+            usable: [false; LANES],
+            instrument: [false; LANES],
+        };
+        let pairs = upper.chunks(STEP).zip(lower.chunks(STEP));
+        for (i, (upper, lower)) in pairs.enumerate().take(count) {
+            let ([a, b, ..], [c, d, ..]) = (upper, lower) else {
+                break;
+            };
+            if !inside(i) {
+                continue;
+            }
+            let mut color = [0.0; 3];
+            let mut highest = 0;
+            for k in 0..3 {
+                let sum = u16::from(a[k]) + u16::from(b[k]) + u16::from(c[k]) + u16::from(d[k]);
+                color[k] = f32::from(sum) / 4.0;
+                highest = highest.max(a[k].max(b[k]).max(c[k].max(d[k])));
+            }
+            let color = correct(color);
+            for (plane, value) in samples.colors.iter_mut().zip(color) {
+                plane[i] = value;
+            }
+            samples.usable[i] = f32::from(highest) < CLIPPED_LEVEL;
+        }
+        samples
+    }
+
+    #[inline(always)]
+    fn kinds(&self, judged: impl Fn([f32; 3]) -> [f32; 3]) -> [Kind; LANES] {
+        let mut kinds = [Kind::Other; LANES];
+        let [red, green, blue] = &self.colors;
+        for i in 0..LANES {
+            let seen = judged([red[i], green[i], blue[i]]);
+            let highest = seen[0].max(seen[1]).max(seen[2]);
+            let lowest = seen[0].min(seen[1]).min(seen[2]);
+            let saturation = (highest - lowest) / highest;
+            let specular = (highest > SPECULAR_LEVEL) & (saturation < SPECULAR_SATURATION);
+            let lit = self.usable[i] & (highest >= MIN_LEVEL) & !specular;
+            let steel = (saturation < STEEL_SATURATION) | self.instrument[i];
+            let kind = if steel { Kind::Steel } else { Kind::Tissue };
+            kinds[i] = if lit { kind } else { Kind::Other };
+        }
+        kinds
+    }
+}
+
 /// Measure the tissue of a picture. `correct` maps each sample first (a camera's fixed correction); `judged` maps the result
 /// further, to the reference's colors as far as they are known: whether a color is steel can only be told there, because a
 /// tint gives steel a color.
@@ -57,38 +134,33 @@ pub fn measure(
     let mut sum = [0.0_f64; 3];
     let mut products = [0.0_f64; 6];
     for y in (STEP / 2..height.saturating_sub(1)).step_by(STEP) {
-        let (upper, lower) = (image.row(y), image.row(y + 1));
-        for x in (STEP / 2..width.saturating_sub(1)).step_by(STEP) {
-            if field_of_view.is_some_and(|mask| mask.at(x, y) == 0) {
-                continue;
+        let columns: usize = (STEP / 2..width.saturating_sub(1)).len();
+        for first in (0..columns.div_ceil(STEP)).step_by(LANES) {
+            let left = STEP / 2 + first * STEP;
+            let count = LANES.min(columns.div_ceil(STEP) - first);
+            let inside = |i: usize| field_of_view.is_none_or(|mask| mask.at(left + i * STEP, y) != 0);
+            let mut samples = Samples::gather(image, (left, y), count, inside, &correct);
+            if let Some(mask) = instruments {
+                for i in 0..count {
+                    samples.instrument[i] = mask.at(left + i * STEP, y) != 0;
+                }
             }
-            let four = [upper[x], upper[x + 1], lower[x], lower[x + 1]];
-            let color: [f32; 3] = std::array::from_fn(|c| four.iter().map(|pixel| f32::from(pixel[c])).sum::<f32>() / 4.0);
-            if four.iter().flatten().any(|v| f32::from(*v) >= CLIPPED_LEVEL) {
-                continue;
-            }
-            let color = correct(color);
-            let seen = judged(color);
-            let highest = seen[0].max(seen[1]).max(seen[2]);
-            let lowest = seen[0].min(seen[1]).min(seen[2]);
-            if highest < MIN_LEVEL {
-                continue;
-            }
-            let saturation = (highest - lowest) / highest;
-            if highest > SPECULAR_LEVEL && saturation < SPECULAR_SATURATION {
-                continue;
-            }
-            if saturation < STEEL_SATURATION || instruments.is_some_and(|mask| mask.at(x, y) != 0) {
-                steel += 1;
-                continue;
-            }
-            tissue += 1;
-            let [r, g, b] = color.map(f64::from);
-            for (sum, value) in sum.iter_mut().zip([r, g, b]) {
-                *sum += value;
-            }
-            for (sum, value) in products.iter_mut().zip([r * r, r * g, r * b, g * g, g * b, b * b]) {
-                *sum += value;
+            let kinds = samples.kinds(&judged);
+            for (i, kind) in kinds.into_iter().enumerate().take(count) {
+                match kind {
+                    Kind::Other => {}
+                    Kind::Steel => steel += 1,
+                    Kind::Tissue => {
+                        tissue += 1;
+                        let [r, g, b] = [0, 1, 2].map(|c| f64::from(samples.colors[c][i]));
+                        for (sum, value) in sum.iter_mut().zip([r, g, b]) {
+                            *sum += value;
+                        }
+                        for (sum, value) in products.iter_mut().zip([r * r, r * g, r * b, g * g, g * b, b * b]) {
+                            *sum += value;
+                        }
+                    }
+                }
             }
         }
     }

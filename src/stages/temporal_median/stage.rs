@@ -9,12 +9,14 @@ use crate::image::wide;
 use crate::pipeline::stage::{Stage, StageError};
 use crate::stages::scene_cut::SceneCut;
 use crate::stages::temporal_median::guard::{self, Guard};
-use crate::stages::temporal_median::history::History;
+use crate::stages::temporal_median::history::{History, TILE};
 use crate::stages::temporal_median::motion::{BLOCK, Motion};
 use crate::stages::temporal_median::particles::{Evidence, Particles, Side};
 use crate::stages::temporal_median::settings::{Settings, SettingsError};
 use crate::stages::temporal_median::vector_median::{Colors, Run, Wide};
 
+/// The median of a tile costs the same however much of it is asked for.
+const BLOCKS_PER_TILE: usize = TILE / BLOCK;
 /// A gap of more periods than this makes the history worthless.
 const MAX_GAP_PERIODS: f64 = 2.6;
 /// Standard deviation of one channel's noise over that of the gray, (1² + 2² + 1²) / 4² inverted and rooted.
@@ -115,9 +117,14 @@ impl TemporalMedian {
                 let rows = output.chunks_exact_mut(width).zip(departs.chunks_exact_mut(width));
                 for (y, (output, departs)) in rows.enumerate() {
                     let mut block = 0;
-                    for run in motions.chunk_by(|a, b| (*a == Motion::Moving) == (*b == Motion::Moving)) {
-                        let (left, right) = (block * BLOCK, ((block + run.len()) * BLOCK).min(width));
-                        if run[0] != Motion::Moving {
+                    while block < columns {
+                        let idle = is_idle(motions, block);
+                        let mut end = block + BLOCKS_PER_TILE;
+                        while end < columns && is_idle(motions, end) == idle {
+                            end += BLOCKS_PER_TILE;
+                        }
+                        let (left, right) = (block * BLOCK, (end * BLOCK).min(width));
+                        if !idle {
                             wide::run(Run::<N> {
                                 window,
                                 start: (top + y) * width + left,
@@ -127,19 +134,50 @@ impl TemporalMedian {
                                 method,
                                 distance,
                             });
-                        } else if departing[block..block + run.len()].contains(&true) {
-                            departs[left..right].fill(0);
                         }
-                        block += run.len();
+                        block = end;
                     }
                 }
-                departing.fill(false);
-                for departs in departs.chunks_exact(width) {
-                    for ((departing, departs), motion) in departing.iter_mut().zip(departs.chunks(BLOCK)).zip(motions) {
-                        *departing |= *motion != Motion::Moving && departs.iter().fold(0, |any, departs| any | departs) != 0;
-                    }
-                }
+                note_departing(departs, width, motions, departing);
             });
+    }
+}
+
+/// Whether all blocks of the tile that begins with `block` move.
+fn is_idle(motions: &[Motion], block: usize) -> bool {
+    motions[block..]
+        .iter()
+        .take(BLOCKS_PER_TILE)
+        .all(|motion| *motion == Motion::Moving)
+}
+
+/// Say which blocks of a band depart, and make those that move depart nowhere. On entry `departing` says where `departs` may be set
+/// from the frame before.
+fn note_departing(departs: &mut [u8], width: usize, motions: &[Motion], departing: &mut [bool]) {
+    for (block, (motion, departing)) in motions.iter().zip(departing).enumerate() {
+        let left = block * BLOCK;
+        let rows = departs.chunks_exact_mut(width).map(|row| &mut row[left..]);
+        if *motion == Motion::Moving {
+            let computed = !is_idle(motions, block / BLOCKS_PER_TILE * BLOCKS_PER_TILE);
+            if computed || *departing {
+                for row in rows {
+                    match row.first_chunk_mut::<BLOCK>() {
+                        Some(row) => *row = [0; BLOCK],
+                        None => row.fill(0),
+                    }
+                }
+            }
+            *departing = false;
+        } else {
+            let mut any = 0;
+            for row in rows {
+                any |= match row.first_chunk::<BLOCK>() {
+                    Some(row) => u128::from_ne_bytes(*row),
+                    None => row.iter().fold(0, |any, departs| any | u128::from(*departs)),
+                };
+            }
+            *departing = any != 0;
+        }
     }
 }
 

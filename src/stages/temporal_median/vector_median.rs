@@ -7,15 +7,12 @@
 //! Everything is computed in one width and chosen by selection instead of branches, so that the compiler keeps the whole competition
 //! in vector registers (in mixed widths it was ten times slower). The sum of absolute differences is first tried in u8, 32 pixels at a
 //! time, with additions that stop at 255: where the winner's sum stays below, it is exact and so is the choice. Colors that lie so far
-//! apart that it does not are rare; their chunk is done again in i16, as are the other medians.
+//! apart that it does not are rare; their tile is done again in i16, as are the other medians.
 
 use crate::image::buffer::Rgb8;
 use crate::image::wide::Kernel;
-use crate::stages::temporal_median::history::Planes;
+use crate::stages::temporal_median::history::{Planes, TILE, Tile};
 use crate::stages::temporal_median::settings::{Distance, Method};
-
-/// Pixels at a time. A shorter rest costs as much as a whole chunk, and between moving blocks runs are short.
-const CHUNK: usize = 64;
 
 /// A color, widened.
 pub type Wide = [i16; 3];
@@ -62,47 +59,39 @@ where
         let Self {
             window,
             start,
-            median,
-            departs,
+            mut median,
+            mut departs,
             threshold,
             ..
         } = self;
         let mut at = start;
-        for (median, departs) in median.chunks_mut(CHUNK).zip(departs.chunks_mut(CHUNK)) {
-            let n = median.len().min(CHUNK);
-            let mut padded = [[[0; CHUNK]; 3]; N];
-            // Past the run's end the neighbours are computed along; only the picture's last chunk is padded.
-            let inside = window[0].gray.len() >= at + CHUNK;
-            if !inside {
-                for (padded, planes) in padded.iter_mut().zip(&window) {
-                    for (padded, plane) in padded.iter_mut().zip(&planes.color) {
-                        padded[..n].copy_from_slice(&plane[at..at + n]);
-                    }
+        let mut results = [[0; TILE]; 4];
+        while !median.is_empty() && !departs.is_empty() {
+            // Before the run's start and past its end the neighbours are computed along.
+            let skipped = at % TILE;
+            let n = median.len().min(departs.len()).min(TILE - skipped);
+            let mut colors = [&NO_TILE; N];
+            for (colors, planes) in colors.iter_mut().zip(&window) {
+                if let Some(tile) = planes.color.get(at / TILE) {
+                    *colors = tile;
                 }
             }
-            let colors: [[&[u8; CHUNK]; 3]; N] = std::array::from_fn(|frame| {
-                std::array::from_fn(|channel| {
-                    let plane = window[frame].color[channel].get(at..).and_then(|rest| rest.first_chunk());
-                    plane.unwrap_or(&padded[frame][channel])
-                })
-            });
-            let results = match M::narrow(&colors, threshold) {
-                Some(results) => results,
-                None => wide_chunk::<N, M>(&colors, threshold),
-            };
-            let [red, green, blue, far] = &results;
-            let mut pixels = [[0; 3]; CHUNK];
-            for i in 0..CHUNK {
-                pixels[i] = [red[i], green[i], blue[i]];
+            if !M::narrow(&colors, threshold, &mut results) {
+                wide_tile::<N, M>(&colors, threshold, &mut results);
             }
-            match (median.first_chunk_mut::<CHUNK>(), departs.first_chunk_mut::<CHUNK>()) {
-                (Some(median), Some(departs)) => {
-                    *median = pixels;
-                    *departs = *far;
+            let (to, to_departs);
+            (to, median) = median.split_at_mut(n);
+            (to_departs, departs) = departs.split_at_mut(n);
+            match (to.first_chunk_mut::<TILE>(), to_departs.first_chunk_mut::<TILE>()) {
+                (Some(to), Some(to_departs)) => {
+                    join(&results, to);
+                    *to_departs = results[3];
                 }
                 _ => {
-                    median.copy_from_slice(&pixels[..n]);
-                    departs.copy_from_slice(&far[..n]);
+                    let mut pixels = [[0; 3]; TILE];
+                    join(&results, &mut pixels);
+                    to.copy_from_slice(&pixels[skipped..skipped + n]);
+                    to_departs.copy_from_slice(&results[3][skipped..skipped + n]);
                 }
             }
             at += n;
@@ -110,24 +99,37 @@ where
     }
 }
 
-/// Red, green and blue of the median and 255 where the newest color departs from it, in i16.
+/// Stands in for tiles past the picture's end.
+static NO_TILE: Tile = [[0; TILE]; 3];
+
+/// Red, green and blue of a tile's median, and 255 where the newest color departs from it.
+type Results = [[u8; TILE]; 4];
+
 #[inline(always)]
-fn wide_chunk<const N: usize, M: Median>(colors: &[[&[u8; CHUNK]; 3]; N], threshold: u8) -> [[u8; CHUNK]; 4]
+fn join([red, green, blue, _]: &Results, pixels: &mut [Rgb8; TILE]) {
+    for i in 0..TILE {
+        pixels[i] = [red[i], green[i], blue[i]];
+    }
+}
+
+/// The median of a tile in i16.
+#[inline(always)]
+fn wide_tile<const N: usize, M: Median>(colors: &[&Tile; N], threshold: u8, results: &mut Results)
 where
     [Wide; N]: Colors<N>,
 {
     // The window and the results lie in local arrays of fixed length: nothing else can point to them and no index can
     // leave them, so the compiler vectorizes without asking.
-    let mut wide = [[[0_i16; CHUNK]; 3]; N];
+    let mut wide = [[[0_i16; TILE]; 3]; N];
     for (wide, colors) in wide.iter_mut().zip(colors) {
-        for (wide, levels) in wide.iter_mut().zip(colors) {
+        for (wide, levels) in wide.iter_mut().zip(colors.iter()) {
             *wide = widened(levels);
         }
     }
-    let mut results = [[0_i16; CHUNK]; 4];
+    let mut wide_results = [[0_i16; TILE]; 4];
     let threshold = i16::from(threshold);
-    let [red, green, blue, far] = &mut results;
-    for i in 0..CHUNK {
+    let [red, green, blue, far] = &mut wide_results;
+    for i in 0..TILE {
         let pixel = <[Wide; N]>::gather(&wide, i);
         let [r, g, b] = M::of(pixel);
         let [now_r, now_g, now_b] = pixel[0];
@@ -138,19 +140,18 @@ where
         green[i] = g;
         blue[i] = b;
     }
-    [narrowed(red), narrowed(green), narrowed(blue), narrowed(far)]
+    *results = [narrowed(red), narrowed(green), narrowed(blue), narrowed(far)];
 }
 
-/// The same as [`wide_chunk`] for sums of absolute differences, in u8; `None` where that is too narrow.
+/// The same as [`wide_tile`] for sums of absolute differences, in u8; false where that is too narrow.
 #[inline(always)]
-fn narrow_chunk<const N: usize>(colors: &[[&[u8; CHUNK]; 3]; N], threshold: u8) -> Option<[[u8; CHUNK]; 4]>
+fn narrow_tile<const N: usize>(colors: &[&Tile; N], threshold: u8, results: &mut Results) -> bool
 where
     [Wide; N]: Colors<N>,
 {
-    let mut results = [[0_u8; CHUNK]; 4];
-    let mut sums = [0_u8; CHUNK];
-    let [red, green, blue, far] = &mut results;
-    for i in 0..CHUNK {
+    let mut sums = [0_u8; TILE];
+    let [red, green, blue, far] = results;
+    for i in 0..TILE {
         let ([r, g, b], sum) = <[Wide; N]>::narrow_vector_median(colors, i);
         let [now_r, now_g, now_b] = [colors[0][0][i], colors[0][1][i], colors[0][2][i]];
         let apart = r.abs_diff(now_r).max(g.abs_diff(now_g)).max(b.abs_diff(now_b));
@@ -161,13 +162,13 @@ where
         sums[i] = sum;
     }
     let largest = sums.iter().fold(0, |largest: u8, sum| largest.max(*sum));
-    (largest < u8::MAX).then_some(results)
+    largest < u8::MAX
 }
 
 #[inline(always)]
-fn widened(levels: &[u8; CHUNK]) -> [i16; CHUNK] {
-    let mut wide = [0; CHUNK];
-    for i in 0..CHUNK {
+fn widened(levels: &[u8; TILE]) -> [i16; TILE] {
+    let mut wide = [0; TILE];
+    for i in 0..TILE {
         wide[i] = i16::from(levels[i]);
     }
     wide
@@ -180,13 +181,13 @@ trait Median {
     where
         [Wide; N]: Colors<N>;
 
-    /// See [`narrow_chunk`].
+    /// See [`narrow_tile`].
     #[inline(always)]
-    fn narrow<const N: usize>(_colors: &[[&[u8; CHUNK]; 3]; N], _threshold: u8) -> Option<[[u8; CHUNK]; 4]>
+    fn narrow<const N: usize>(_colors: &[&Tile; N], _threshold: u8, _results: &mut Results) -> bool
     where
         [Wide; N]: Colors<N>,
     {
-        None
+        false
     }
 }
 
@@ -214,11 +215,11 @@ impl Median for VectorL1 {
     }
 
     #[inline(always)]
-    fn narrow<const N: usize>(colors: &[[&[u8; CHUNK]; 3]; N], threshold: u8) -> Option<[[u8; CHUNK]; 4]>
+    fn narrow<const N: usize>(colors: &[&Tile; N], threshold: u8, results: &mut Results) -> bool
     where
         [Wide; N]: Colors<N>,
     {
-        narrow_chunk(colors, threshold)
+        narrow_tile(colors, threshold, results)
     }
 }
 
@@ -233,9 +234,9 @@ impl Median for VectorL2 {
 }
 
 #[inline(always)]
-fn narrowed(levels: &[i16; CHUNK]) -> [u8; CHUNK] {
-    let mut narrow = [0; CHUNK];
-    for i in 0..CHUNK {
+fn narrowed(levels: &[i16; TILE]) -> [u8; TILE] {
+    let mut narrow = [0; TILE];
+    for i in 0..TILE {
         narrow[i] = levels[i] as u8;
     }
     narrow
@@ -259,10 +260,10 @@ fn l2(a: Wide, b: Wide) -> i16 {
 /// The colors one pixel had, newest first.
 pub trait Colors<const N: usize> {
     /// Pixel `at` of each frame.
-    fn gather(planes: &[[[i16; CHUNK]; 3]; N], at: usize) -> Self;
+    fn gather(planes: &[[[i16; TILE]; 3]; N], at: usize) -> Self;
     /// Of pixel `at` of each frame the color with the smallest summed L1 distance to the others, and that sum, at most 255: only below
     /// are both exact.
-    fn narrow_vector_median(planes: &[[&[u8; CHUNK]; 3]; N], at: usize) -> (Rgb8, u8);
+    fn narrow_vector_median(planes: &[&Tile; N], at: usize) -> (Rgb8, u8);
     /// The color with the smallest summed distance to the others.
     fn vector_median(self, distance: impl Fn(Wide, Wide) -> i16) -> Wide;
     /// The median of each channel.
@@ -276,12 +277,12 @@ macro_rules! colors {
         [$(($low:literal, $high:literal)),*]) => {
         impl Colors<$n> for [Wide; $n] {
             #[inline(always)]
-            fn gather(planes: &[[[i16; CHUNK]; 3]; $n], at: usize) -> Self {
+            fn gather(planes: &[[[i16; TILE]; 3]; $n], at: usize) -> Self {
                 [$([planes[$all][0][at], planes[$all][1][at], planes[$all][2][at]]),*]
             }
 
             #[inline(always)]
-            fn narrow_vector_median(planes: &[[&[u8; CHUNK]; 3]; $n], at: usize) -> (Rgb8, u8) {
+            fn narrow_vector_median(planes: &[&Tile; $n], at: usize) -> (Rgb8, u8) {
                 let colors = [$([planes[$all][0][at], planes[$all][1][at], planes[$all][2][at]]),*];
                 let mut sums = [0_u8; $n];
                 $(
@@ -384,8 +385,10 @@ mod tests {
     {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let planes: [Planes; N] = std::array::from_fn(|_| Planes {
-            color: std::array::from_fn(|_| (0..pixels).map(|_| random.random_range(0..=spread)).collect()),
-            gray: vec![0; pixels],
+            color: (0..pixels.div_ceil(TILE))
+                .map(|_| std::array::from_fn(|_| std::array::from_fn(|_| random.random_range(0..=spread))))
+                .collect(),
+            gray: Vec::new(),
         });
         for (method, distance) in [
             (Method::Vector, Distance::L1),
@@ -406,7 +409,8 @@ mod tests {
                 distance,
             });
             for i in 0..pixels - start {
-                let colors: [Rgb8; N] = std::array::from_fn(|k| [0, 1, 2].map(|c| planes[k].color[c][start + i]));
+                let colors: [Rgb8; N] =
+                    std::array::from_fn(|k| [0, 1, 2].map(|c| planes[k].color[(start + i) / TILE][c][(start + i) % TILE]));
                 let expected = match method {
                     Method::Vector => reference_vector(&colors, distance),
                     Method::Marginal => reference_marginal(&colors),
