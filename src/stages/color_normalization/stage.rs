@@ -139,12 +139,11 @@ impl ColorNormalization {
     }
 
     fn measure(&self, frame: &Frame) -> Measurement {
-        let instruments: Option<&Image<u8>> = None;
         let field_of_view = frame.field_of_view.as_deref();
         let judged = |c| self.gains.apply(c);
         match &self.correction {
-            Some(correction) => statistics::measure(&frame.image, field_of_view, instruments, |c| correction.apply(c), judged),
-            None => statistics::measure(&frame.image, field_of_view, instruments, |c| c, judged),
+            Some(correction) => statistics::measure(&frame.image, field_of_view, |c| correction.apply(c), judged),
+            None => statistics::measure(&frame.image, field_of_view, |c| c, judged),
         }
     }
 

@@ -55,7 +55,6 @@ struct Samples {
     colors: [[f32; LANES]; 3],
     /// In the image field, and not clipped.
     usable: [bool; LANES],
-    instrument: [bool; LANES],
 }
 
 impl Samples {
@@ -72,7 +71,6 @@ impl Samples {
         let mut samples = Self {
             colors: [[0.0; LANES]; 3],
             usable: [false; LANES],
-            instrument: [false; LANES],
         };
         let pairs = upper.chunks(STEP).zip(lower.chunks(STEP));
         for (i, (upper, lower)) in pairs.enumerate().take(count) {
@@ -109,8 +107,11 @@ impl Samples {
             let saturation = (highest - lowest) / highest;
             let specular = (highest > SPECULAR_LEVEL) & (saturation < SPECULAR_SATURATION);
             let lit = self.usable[i] & (highest >= MIN_LEVEL) & !specular;
-            let steel = (saturation < STEEL_SATURATION) | self.instrument[i];
-            let kind = if steel { Kind::Steel } else { Kind::Tissue };
+            let kind = if saturation < STEEL_SATURATION {
+                Kind::Steel
+            } else {
+                Kind::Tissue
+            };
             kinds[i] = if lit { kind } else { Kind::Other };
         }
         kinds
@@ -123,13 +124,11 @@ impl Samples {
 pub fn measure(
     image: &Image<Rgb8>,
     field_of_view: Option<&Mask>,
-    instruments: Option<&Image<u8>>,
     correct: impl Fn([f32; 3]) -> [f32; 3],
     judged: impl Fn([f32; 3]) -> [f32; 3],
 ) -> Measurement {
     let (width, height) = image.size();
     let field_of_view = field_of_view.filter(|mask| mask.size() == image.size());
-    let instruments = instruments.filter(|mask| mask.size() == image.size());
     let (mut tissue, mut steel) = (0_usize, 0_usize);
     let mut sum = [0.0_f64; 3];
     let mut products = [0.0_f64; 6];
@@ -139,12 +138,7 @@ pub fn measure(
             let left = STEP / 2 + first * STEP;
             let count = LANES.min(columns.div_ceil(STEP) - first);
             let inside = |i: usize| field_of_view.is_none_or(|mask| mask.at(left + i * STEP, y) != 0);
-            let mut samples = Samples::gather(image, (left, y), count, inside, &correct);
-            if let Some(mask) = instruments {
-                for i in 0..count {
-                    samples.instrument[i] = mask.at(left + i * STEP, y) != 0;
-                }
-            }
+            let samples = Samples::gather(image, (left, y), count, inside, &correct);
             let kinds = samples.kinds(&judged);
             for (i, kind) in kinds.into_iter().enumerate().take(count) {
                 match kind {
@@ -205,7 +199,7 @@ mod tests {
                 image.set(x, y, color);
             }
         }
-        let found = measure(&image, None, None, |c| c, |c| c);
+        let found = measure(&image, None, |c| c, |c| c);
         let statistics = found.statistics.unwrap();
         // Uniform ±30 averaged over 2 × 2: variance 300 / 4 = 75, its mean known to 8.7 / √2750 = 0.17.
         assert!(
