@@ -93,7 +93,7 @@ fn flicker(images: &[Image<Rgb8>]) -> f64 {
 }
 
 fn reference() -> Statistics {
-    statistics::measure(&picture([1.0; 3], 0.0, 0), None, None, |c| c, |c| c)
+    statistics::measure(&picture([1.0; 3], 0.0, 0), None, |c| c, |c| c)
         .statistics
         .unwrap()
 }
@@ -155,7 +155,7 @@ fn color_yaml_gives_the_reference_and_half_the_strength_goes_half_the_way() {
         };
         let mut stage = ColorNormalization::new(&settings, Some(&file)).unwrap();
         let result = run(&mut stage, &tinted);
-        let mean = statistics::measure(&result[0], None, None, |c| c, |c| c)
+        let mean = statistics::measure(&result[0], None, |c| c, |c| c)
             .statistics
             .unwrap()
             .mean;

@@ -50,3 +50,11 @@ pub fn fetch<T>(items: &[T], index: usize) {
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (items, index);
 }
+
+/// Rounded to the nearest level, ties to even: added to 2²³ a float keeps its integer in the low bits. A plain conversion
+/// saturates, for which there is no vector instruction.
+#[inline(always)]
+pub fn byte_from(value: f32) -> u8 {
+    const INTEGER_BITS: f32 = 8_388_608.0;
+    (value.clamp(0.0, 255.0) + INTEGER_BITS).to_bits() as u8
+}

@@ -153,10 +153,11 @@ impl Kernel for CellRow<'_> {
                 rgb: &mut rgb[range.clone()],
                 peak: &mut peak[range],
             };
-            if step == 8 {
-                finish::<8>(&sums, &peaks, step, found);
-            } else {
-                finish::<0>(&sums, &peaks, step, found);
+            // The step of pictures of the working width, and of views twice as wide, is known to the compiler.
+            match step {
+                4 => finish::<4>(&sums, &peaks, step, found),
+                8 => finish::<8>(&sums, &peaks, step, found),
+                _ => finish::<0>(&sums, &peaks, step, found),
             }
         }
     }

@@ -7,7 +7,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use crate::image::buffer::Rgb8;
-use crate::image::wide::Kernel;
+use crate::image::wide::{Kernel, byte_from};
 
 /// Below this brightest channel a pixel is left exactly as it is, levels.
 pub const BLACK_LEVEL: f32 = 10.0;
@@ -144,14 +144,6 @@ pub fn keep_surround(source: &[Rgb8], target: &mut [Rgb8], field_of_view: &[u8])
             *target = *source;
         }
     }
-}
-
-/// Rounded to the nearest level, ties to even: added to 2²³ a float keeps its integer in the low bits. A plain conversion
-/// saturates, for which there is no vector instruction.
-#[inline(always)]
-fn byte_from(value: f32) -> u8 {
-    const INTEGER_BITS: f32 = 8_388_608.0;
-    (value.clamp(0.0, 255.0) + INTEGER_BITS).to_bits() as u8
 }
 
 /// The length is fixed and known, so that nothing is left over for a loop over single pixels.

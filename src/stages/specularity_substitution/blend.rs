@@ -6,10 +6,12 @@ use rayon::prelude::*;
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::color::luma;
 use crate::light_field::lamp_share::difference;
-use crate::stages::specularity_substitution::drawing::{Bench, Chosen, Spot};
+use crate::stages::specularity_substitution::drawing::Bench;
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, Sums};
 use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
 use crate::stages::specularity_substitution::scene::Scene;
+use crate::stages::specularity_substitution::speaker::Chosen;
+use crate::stages::specularity_substitution::spots::Spot;
 
 /// A pixel this much darker than what was measured may be noise, levels.
 const NOISE_LEVELS: f32 = 5.0;
@@ -141,7 +143,7 @@ impl Canvas {
                 let across = scene.grid.blocks().0;
                 for i in (0..across).filter(|i| live.hole_blocks[j * across + i] != 0) {
                     bench.blend(scene, holes, chosen, i, j);
-                    for plain in &bench.plain {
+                    for plain in &bench.spots.plain {
                         let (top, step) = (plain.top - j * scene.grid.block(), scene.grid.step);
                         for (y, live) in (top..top + step).zip(plain.top..) {
                             let columns = plain.left..plain.left + step;

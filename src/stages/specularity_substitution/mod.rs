@@ -30,6 +30,8 @@ pub mod scene;
 pub mod settings;
 pub mod sight;
 pub mod small_view;
+pub mod speaker;
+pub mod spots;
 pub mod stage;
 pub mod support;
 mod surface_depth;

@@ -303,7 +303,7 @@ impl wide::Kernel for Carry<'_, '_, '_> {
                 for c in 0..3 {
                     for lane in 0..LANES {
                         let more = (mixed[c][lane] - mixed[3][lane] * old[c][lane]) * (1.0 / 255.0);
-                        new[c][lane] = (old[c][lane] + more + 0.5) as i32 as u8;
+                        new[c][lane] = wide::byte_from(old[c][lane] + more);
                     }
                 }
                 for lane in 0..count {
@@ -405,7 +405,7 @@ impl wide::Kernel for Decide<'_> {
             decided[lane] = if share < LEAST_SHARE {
                 TISSUE
             } else {
-                (255.0 * share + 0.5) as i32 as u8
+                wide::byte_from(255.0 * share)
             };
         }
         let beliefs = &canvas.belief.row(y)[columns];

@@ -15,7 +15,6 @@ use crate::light_field::view::LightField;
 use crate::pipeline::stage::{Stage, StageError};
 use crate::stages::specularity_substitution::blend::Canvas;
 use crate::stages::specularity_substitution::camera_blending::CameraBlending;
-use crate::stages::specularity_substitution::drawing::Chosen;
 use crate::stages::specularity_substitution::grid::{Division, Grid};
 use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::replacement::{Decision, Planes, Shares, mark_left, replace};
@@ -23,6 +22,7 @@ use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 use crate::stages::specularity_substitution::sight::{Vantage, Views};
 use crate::stages::specularity_substitution::small_view::SmallView;
+use crate::stages::specularity_substitution::speaker::Chosen;
 use crate::stages::specularity_substitution::surface_depth::{SurfaceDepth, depth_step};
 use crate::stages::specularity_substitution::view_fit::{Comparison, Statistics, ViewFit, Workbench};
 
