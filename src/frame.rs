@@ -93,7 +93,7 @@ pub struct Alignment {
 pub struct StageTiming {
     /// The stage's name.
     pub stage: &'static str,
-    /// Taken from the queue.
+    /// When the stage began with it.
     pub entered: Timestamp,
     /// Handed on.
     pub left: Timestamp,

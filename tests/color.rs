@@ -155,10 +155,7 @@ fn color_yaml_gives_the_reference_and_half_the_strength_goes_half_the_way() {
         };
         let mut stage = ColorNormalization::new(&settings, Some(&file)).unwrap();
         let result = run(&mut stage, &tinted);
-        let mean = statistics::measure(&result[0], None, |c| c, |c| c)
-            .statistics
-            .unwrap()
-            .mean;
+        let mean = statistics::measure(&result[0], None, |c| c, |c| c).statistics.unwrap().mean;
         (mean - reference.mean).norm()
     };
     let (none, half, full) = (distance(0.0), distance(0.5), distance(1.0));

@@ -16,6 +16,8 @@ use crate::image::specularity::steel::Steel;
 const NEARLY_CLIPPED_LEVEL: u8 = 240;
 /// A region beyond `max_region_share` is specular only if more than this share of it is nearly clipped.
 const MIN_CLIPPED_SHARE: f32 = 0.1;
+/// Of other large regions only what lies within this square around nearly clipped pixels is, px at 960 px width.
+const AROUND_CLIPPED_PX: f32 = 4.0;
 /// A single core pixel may be noise.
 const MIN_CORE_PX: u32 = 2;
 
@@ -162,11 +164,33 @@ impl SpecularityDetector {
             }
         }
         let counts = &self.counts;
+        let is_core = |label: usize| counts[label][0] >= MIN_CORE_PX;
+        let is_plausible =
+            |label: usize, area: u32| !is_large(label) || counts[label][1] as f32 > MIN_CLIPPED_SHARE * area as f32;
         self.components.paint(specular, 255, |label, region| {
-            let [cores, clipped] = counts[label];
-            let plausible = !is_large(label) || clipped as f32 > MIN_CLIPPED_SHARE * region.area as f32;
-            cores >= MIN_CORE_PX && plausible
+            is_core(label) && is_plausible(label, region.area)
         });
+        // Of what is too large to be one specularity, a droplet on pale tissue or a cluster whose halos flow together, only what lies
+        // around clipped pixels is the lamp's for sure.
+        let around = (AROUND_CLIPPED_PX * width as f32 / REFERENCE_WIDTH_PX).round() as usize;
+        for run in self.components.runs() {
+            let (label, area) = (run.label as usize, self.components.regions()[run.label as usize].area);
+            if is_plausible(label, area) || !is_core(label) {
+                continue;
+            }
+            let y = run.y as usize;
+            for x in run.begin as usize..run.end as usize {
+                if image.at(x, y).iter().all(|level| *level >= NEARLY_CLIPPED_LEVEL) {
+                    for v in y.saturating_sub(around)..(y + around + 1).min(height) {
+                        let columns = x.saturating_sub(around)..(x + around + 1).min(width);
+                        let halos = &self.halos.row(v)[columns.clone()];
+                        for (specular, &halo) in specular.row_mut(v)[columns].iter_mut().zip(halos) {
+                            *specular |= halo;
+                        }
+                    }
+                }
+            }
+        }
     }
 }
 
