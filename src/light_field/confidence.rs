@@ -16,7 +16,7 @@ const SILENT_PX: f32 = 4.0;
 /// Full voice from this distance on.
 const FULL_PX: f32 = 9.0;
 /// Darker than this in every channel is the endoscope's black surround, not tissue.
-const BLACK: u8 = 10;
+pub(super) const BLACK: u8 = 10;
 
 /// 0 on specularities, out of the image field and in the black; a ramp around them; 255 elsewhere. `field` is 0 out of the
 /// image field.

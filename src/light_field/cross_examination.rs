@@ -9,9 +9,10 @@
 
 use rayon::prelude::*;
 
-use crate::image::buffer::{Image, Mask};
+use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 use crate::image::hole_filling::HoleFiller;
+use crate::light_field::confidence::BLACK;
 use crate::light_field::lamp_share::{Tissue, difference};
 use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::{LampShading, LightField, View};
@@ -43,6 +44,9 @@ const FAINT: f32 = 0.08;
 const DARK_LEVELS: f32 = 8.0;
 /// Depth is carried into holes over about 2 to this power, px.
 const DEPTH_REACH_LEVELS: usize = 6;
+/// So near the black around the endoscope's field nothing is asked and nobody answers, px of a 960 px wide picture: all views agree
+/// there, on a colour that is no tissue's.
+const SURROUND_PX: f32 = 6.0;
 /// Exposure and lamp are smooth: held for squares of this many pixels along a side.
 const SHADE_PITCH: usize = 8;
 
@@ -50,9 +54,12 @@ const SHADE_PITCH: usize = 8;
 pub fn refine_confidence(light_field: &mut LightField) {
     let field = &*light_field;
     let shades: Vec<Shade> = field.views.par_iter().map(|view| Shade::new(view, &field.shading)).collect();
+    let surrounds: Vec<Mask> = field.views.par_iter().map(|view| surround(&view.image)).collect();
     let settled: Vec<Mask> = (0..field.views.len())
         .into_par_iter()
-        .map_init(HoleFiller::default, |filler, index| examined(field, &shades, index, filler))
+        .map_init(HoleFiller::default, |filler, index| {
+            examined(field, (&shades, &surrounds), index, filler)
+        })
         .collect();
     for (view, confidence) in light_field.views.iter_mut().zip(settled) {
         view.confidence = confidence;
@@ -64,15 +71,15 @@ const SOMETHING_ELSE: f32 = f32::INFINITY;
 /// Nothing is known of this square.
 const UNKNOWN: f32 = f32::NAN;
 
-fn examined(light_field: &LightField, shades: &[Shade], index: usize, filler: &mut HoleFiller) -> Mask {
+fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), index: usize, filler: &mut HoleFiller) -> Mask {
     let view = &light_field.views[index];
     let (width, height) = view.image.size();
     let mut depth = view.depth.clone();
     filler.fill(&mut depth, DEPTH_REACH_LEVELS);
     let near = near_doubt(&view.confidence);
-    let witnesses: Vec<Witness<'_>> = (light_field.views.iter().zip(shades).enumerate())
+    let witnesses: Vec<Witness<'_>> = (light_field.views.iter().zip(shades).zip(surrounds).enumerate())
         .filter(|&(other, _)| other != index)
-        .filter_map(|(_, (other, shade))| Witness::new(view, other, shade))
+        .filter_map(|(_, ((other, shade), surround))| Witness::new(view, (other, shade, surround)))
         .collect();
     let (across, down) = (width / STEP, height / STEP);
     let mut shares = Image::filled(across, down, UNKNOWN);
@@ -81,7 +88,7 @@ fn examined(light_field: &LightField, shades: &[Shade], index: usize, filler: &m
         for column in 0..across {
             let (x, y) = (column * STEP, row * STEP);
             let z = depth.at(x, y);
-            if near.at(x, y) == 0 || z <= 0.0 {
+            if near.at(x, y) == 0 || z <= 0.0 || surrounds[index].at(x, y) != 0 {
                 continue;
             }
             tissue.clear();
@@ -122,19 +129,38 @@ fn examined(light_field: &LightField, shades: &[Shade], index: usize, filler: &m
     despeckled(&confidence, &view.confidence)
 }
 
+/// 255 on black pixels and near them.
+fn surround(image: &Image<Rgb8>) -> Mask {
+    let (width, height) = image.size();
+    let black = image
+        .pixels()
+        .iter()
+        .map(|pixel| if pixel.iter().all(|&level| level < BLACK) { 255 } else { 0 });
+    let Some(mut mask) = Image::from_vec(width, height, black.collect()) else {
+        return Image::filled(width, height, 0);
+    };
+    widen(&mut mask, SURROUND_PX);
+    mask
+}
+
+/// Mark what lies within `reach_px`, of a picture 960 px wide, of what is marked.
+fn widen(mask: &mut Mask, reach_px: f32) {
+    let (width, height) = mask.size();
+    let reach = (reach_px * width as f32 / 960.0 * f32::from(UNITS_PER_PX)) as u16;
+    let mut distance = Image::filled(width, height, 0);
+    chamfer_distance(mask, reach + 1, &mut distance);
+    for (value, &distance) in mask.pixels_mut().iter_mut().zip(distance.pixels()) {
+        *value = if distance <= reach { 255 } else { 0 };
+    }
+}
+
 /// 255 on doubtful pixels and near them.
 fn near_doubt(confidence: &Mask) -> Mask {
-    let (width, height) = confidence.size();
     let mut doubt = confidence.clone();
     for value in doubt.pixels_mut() {
         *value = if *value < 255 { 255 } else { 0 };
     }
-    let reach = (HAZE_REACH_PX * width as f32 / 960.0 * f32::from(UNITS_PER_PX)) as u16;
-    let mut distance = Image::filled(width, height, 0);
-    chamfer_distance(&doubt, reach + 1, &mut distance);
-    for (value, &distance) in doubt.pixels_mut().iter_mut().zip(distance.pixels()) {
-        *value = if distance <= reach { 255 } else { 0 };
-    }
+    widen(&mut doubt, HAZE_REACH_PX);
     doubt
 }
 
@@ -253,12 +279,19 @@ impl Shade {
 struct Witness<'a> {
     view: &'a View,
     shade: &'a Shade,
+    surround: &'a Mask,
     mapping: Mapping,
 }
 
 impl<'a> Witness<'a> {
-    fn new(asking: &View, view: &'a View, shade: &'a Shade) -> Option<Self> {
-        Mapping::new(&asking.camera, &asking.world_from_camera, view).map(|mapping| Self { view, shade, mapping })
+    fn new(asking: &View, (view, shade, surround): (&'a View, &'a Shade, &'a Mask)) -> Option<Self> {
+        let mapping = Mapping::new(&asking.camera, &asking.world_from_camera, view)?;
+        Some(Self {
+            view,
+            shade,
+            surround,
+            mapping,
+        })
     }
 
     /// The common colour of what this view shows where (x, y) at depth z lies; `None` if it does not see that.
@@ -269,7 +302,7 @@ impl<'a> Witness<'a> {
             return None;
         }
         let (column, row) = ((u + 0.5) as usize, (v + 0.5) as usize);
-        is_unoccluded(self.view.depth.at(column, row), depth)
+        (self.surround.at(column, row) == 0 && is_unoccluded(self.view.depth.at(column, row), depth))
             .then(|| self.shade.common(self.view.image.at(column, row).map(f32::from), column, row))
     }
 }
@@ -284,6 +317,20 @@ mod tests {
         assert!(trust.windows(2).all(|w| w[0] >= w[1]), "{trust:?}");
         assert!(trust[1] == 1.0 && trust[4] > 0.0 && trust[5] > 0.0 && trust[7] == 0.0);
         assert_eq!((trust_in(-0.2), trust_in(SOMETHING_ELSE)), (1.0, 0.0));
+    }
+
+    #[test]
+    fn the_black_surround_and_its_rim_are_nobodys_witness() {
+        let mut image = Image::filled(960, 40, [90, 40, 30]);
+        for y in 0..40 {
+            image.row_mut(y)[..100].fill([3, 2, 4]);
+        }
+        let mask = surround(&image);
+        let reach = SURROUND_PX as usize;
+        for y in 0..40 {
+            assert!(mask.row(y)[..99 + reach].iter().all(|&m| m == 255));
+            assert!(mask.row(y)[101 + reach..].iter().all(|&m| m == 0));
+        }
     }
 
     #[test]
