@@ -110,12 +110,12 @@ pub fn complete(
     let maps = {
         let stereo = Stereo::new(&light_field.views, &light_field.points, &settings.stereo);
         let references = stereo.reference_views();
-        let maps = depth_maps(&stereo, &references, progress)?;
+        let (references, maps) = depth_maps(&stereo, &references, progress)?;
         match fuse(&maps, &settings.surface) {
             None => None,
             Some(mesh) => {
                 light_field.surface = mesh;
-                Some(second_pass(light_field, &stereo, &references, settings, progress)?)
+                Some(second_pass(light_field, &stereo, (&references, &maps), settings, progress)?)
             }
         }
     };
@@ -150,13 +150,13 @@ pub fn complete(
 fn second_pass(
     light_field: &LightField,
     stereo: &Stereo<'_>,
-    references: &[usize],
+    (references, first): (&[usize], &[DepthMap]),
     settings: &BuildSettings,
     progress: &dyn Progress,
 ) -> Result<Vec<DepthMap>, LightFieldError> {
     progress.begin("depth, refined", references.len() as u64);
-    let maps: Vec<DepthMap> = (references.par_iter())
-        .filter_map(|&view| {
+    let maps: Vec<DepthMap> = (references.par_iter().zip(first))
+        .filter_map(|(&view, first)| {
             if progress.stopping() {
                 return None;
             }
@@ -169,7 +169,7 @@ fn second_pass(
             };
             let mut depth = Image::filled(0, 0, 0.0);
             DepthRasterizer::new().render(&light_field.surface, &camera, &plane.world_from_camera, &mut depth);
-            let map = stereo.near_surface(view, &depth);
+            let map = stereo.near_surface(view, &depth, &first.depth);
             progress.advance(1);
             map
         })

@@ -7,6 +7,7 @@ use crate::camera::intrinsics::Intrinsics;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::Image;
+use crate::light_field::depth::pairing::{Station, neighbours, references};
 use crate::light_field::depth::plane_sweep::{Plane, Scratch, Sweep, costs};
 use crate::light_field::depth::semi_global::{Paths, Smoothness, Winners, aggregate, winners};
 use crate::light_field::error::LightFieldError;
@@ -72,6 +73,7 @@ pub struct Stereo<'a> {
     fine: Vec<Plane>,
     coarse: Vec<Plane>,
     ranges: Vec<(f64, f64)>,
+    stations: Vec<Station>,
 }
 
 impl<'a> Stereo<'a> {
@@ -92,85 +94,25 @@ impl<'a> Stereo<'a> {
             .iter()
             .map(|view| depth_range(view, points).unwrap_or(fallback))
             .collect();
+        let stations = (views.iter().zip(&ranges))
+            .map(|(view, &(near, far))| Station::new(&view.camera, view.world_from_camera, 2.0 / (1.0 / near + 1.0 / far)))
+            .collect();
         Self {
             settings,
             fine,
             coarse,
             ranges,
+            stations,
         }
     }
 
-    /// Views that cover the survey evenly: farthest-point sampling over where they stand and where they look.
+    /// Views that get a depth map.
     pub fn reference_views(&self) -> Vec<usize> {
-        let places: Vec<Vector3<f64>> = (0..self.fine.len())
-            .map(|i| self.fine[i].world_from_camera.translation() + self.aim(i) * 0.5)
-            .collect();
-        let mut chosen = vec![places.len() / 2];
-        let mut distance: Vec<f64> = vec![f64::INFINITY; places.len()];
-        while chosen.len() < self.settings.reference_views.min(places.len()) {
-            let last = places[chosen[chosen.len() - 1]];
-            for (d, place) in distance.iter_mut().zip(&places) {
-                *d = d.min((place - last).norm());
-            }
-            let next = (0..places.len())
-                .max_by(|&a, &b| distance[a].total_cmp(&distance[b]))
-                .unwrap_or(0);
-            chosen.push(next);
-        }
-        chosen.sort_unstable();
-        chosen.dedup();
-        chosen
+        references(&self.stations, self.settings.reference_views)
     }
 
-    fn middle_depth(&self, view: usize) -> f64 {
-        let (near, far) = self.ranges[view];
-        2.0 / (1.0 / near + 1.0 / far)
-    }
-
-    /// What the view looks at.
-    fn aim(&self, view: usize) -> Vector3<f64> {
-        let pose = &self.fine[view].world_from_camera;
-        pose.translation() + pose.rotation() * Vector3::new(0.0, 0.0, self.middle_depth(view))
-    }
-
-    /// Whom a view is matched with: near the best angle, at a like distance, and from different sides.
-    pub fn neighbours(&self, view: usize) -> Vec<usize> {
-        let aim = self.aim(view);
-        let from = self.fine[view].world_from_camera.translation();
-        let mut scored: Vec<(f64, usize, Vector3<f64>)> = (0..self.fine.len())
-            .filter(|&other| other != view)
-            .filter_map(|other| {
-                let plane = &self.fine[other];
-                let center = plane.world_from_camera.translation();
-                let local = plane.world_from_camera.inverse().isometry().transform_point(&aim.into());
-                let k = &plane.intrinsics;
-                let (x, y) = (k.fx * local.x / local.z + k.cx, k.fy * local.y / local.z + k.cy);
-                let (width, height) = (plane.gray.width() as f64, plane.gray.height() as f64);
-                if local.z <= 0.0 || x < 0.15 * width || y < 0.15 * height || x > 0.85 * width || y > 0.85 * height {
-                    return None;
-                }
-                let angle = (from - aim).angle(&(center - aim));
-                let ratio = ((from - aim).norm() / (center - aim).norm()).ln();
-                let off = (angle.max(1e-6) / self.settings.best_angle_rad).ln();
-                let score = (-off * off / 0.5 - ratio * ratio / 0.12).exp();
-                Some((score, other, (center - from).try_normalize(1e-9)?))
-            })
-            .collect();
-        let mut chosen = Vec::new();
-        while chosen.len() < self.settings.neighbours {
-            let Some(best) = (0..scored.len()).max_by(|&a, &b| scored[a].0.total_cmp(&scored[b].0)) else {
-                break;
-            };
-            let (score, other, side) = scored.swap_remove(best);
-            if score < 1e-4 && chosen.len() >= 2 {
-                break;
-            }
-            chosen.push(other);
-            for (score, _, direction) in &mut scored {
-                *score *= 1.0 - 0.8 * direction.dot(&side).max(0.0).powi(2);
-            }
-        }
-        chosen
+    fn neighbours(&self, view: usize) -> Vec<usize> {
+        neighbours(&self.stations, view, self.settings.neighbours, self.settings.best_angle_rad)
     }
 
     fn longest_baseline(&self, view: usize, neighbours: &[usize]) -> f64 {
@@ -219,16 +161,18 @@ impl<'a> Stereo<'a> {
         Some(self.refined(view, &neighbours, &base, None, 0.5, 11))
     }
 
-    /// Depth of one view near a known surface (`depth` at the fine scale's size, 0 unknown).
-    pub fn near_surface(&self, view: usize, depth: &Image<f32>) -> Option<DepthMap> {
+    /// Depth of one view near a known surface (`depth` at the fine scale's size, 0 unknown), and beyond its rim near what the view's
+    /// own `first` map holds.
+    pub fn near_surface(&self, view: usize, depth: &Image<f32>, first: &Image<f32>) -> Option<DepthMap> {
         let neighbours = self.neighbours(view);
         if neighbours.is_empty() {
             return None;
         }
         let mut base = depth.clone();
-        base.pixels_mut()
-            .iter_mut()
-            .for_each(|z| *z = if *z > 0.0 { 1.0 / *z } else { 0.0 });
+        for (base, &first) in base.pixels_mut().iter_mut().zip(first.pixels()) {
+            let depth = if *base > 0.0 { *base } else { first };
+            *base = if depth > 0.0 { 1.0 / depth } else { 0.0 };
+        }
         let filled = completed(&base);
         Some(self.refined(view, &neighbours, &filled, Some(&base), 0.3, 9))
     }
@@ -317,10 +261,14 @@ impl<'a> Stereo<'a> {
     }
 }
 
-/// Depth maps of all reference views, those depths kept that others confirm.
-pub fn depth_maps(stereo: &Stereo<'_>, references: &[usize], progress: &dyn Progress) -> Result<Vec<DepthMap>, LightFieldError> {
+/// Depth maps of all reference views that have neighbours, those depths kept that others confirm; beside each the view.
+pub fn depth_maps(
+    stereo: &Stereo<'_>,
+    references: &[usize],
+    progress: &dyn Progress,
+) -> Result<(Vec<usize>, Vec<DepthMap>), LightFieldError> {
     progress.begin("depth", references.len() as u64);
-    let maps: Vec<Option<DepthMap>> = (references.par_iter())
+    let maps: Vec<Option<(usize, DepthMap)>> = (references.par_iter())
         .map(|&view| {
             let map = if progress.stopping() {
                 None
@@ -328,15 +276,15 @@ pub fn depth_maps(stereo: &Stereo<'_>, references: &[usize], progress: &dyn Prog
                 stereo.from_scratch(view)
             };
             progress.advance(1);
-            map
+            Some((view, map?))
         })
         .collect();
     progress.end();
     if progress.stopping() {
         return Err(LightFieldError::Stopped);
     }
-    let maps: Vec<DepthMap> = maps.into_iter().flatten().collect();
-    Ok(confirmed(&maps, FIRST_AGREEMENT))
+    let (views, maps): (Vec<usize>, Vec<DepthMap>) = maps.into_iter().flatten().unzip();
+    Ok((views, confirmed(&maps, FIRST_AGREEMENT)))
 }
 
 /// The maps with only those depths that another map sees in the same place; the surface asks for two views once more.
