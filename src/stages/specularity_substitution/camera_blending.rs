@@ -10,8 +10,16 @@ use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::sight::{PLACES_AT_ONCE, Place, Views};
 
-/// At most so many views speak at a corner.
-pub const MAX_VIEWS: usize = 8;
+/// At most so many views speak at a corner for its places …
+const MAX_VIEWS: usize = 8;
+/// … and so many with those that single pixels need.
+const MAX_WITH_MORE: usize = 12;
+
+/// At most so many views speak for the single pixels of a block.
+const MOST_ADDITIONS: usize = 3;
+
+/// A block has no more pixels than this, whatever the picture's width.
+const MOST_PIXELS: usize = 576;
 
 /// So many views are enough once every place was seen.
 const ENOUGH_VIEWS: usize = 4;
@@ -21,6 +29,9 @@ const WANTED_SIGHTINGS: usize = 3;
 
 /// What sighting all places still wanted is worth against a worse angle, rad.
 const SIGHTING_WORTH: f32 = 0.6;
+
+/// Who is needed is heard, however badly it sees.
+const LEAST_WEIGHT: f32 = 0.02;
 
 /// The first sighting of a place is worth more than the second, and that more than the third.
 const WORTH_OF_NEXT: [f32; WANTED_SIGHTINGS] = [1.0, 0.15, 0.05];
@@ -46,7 +57,7 @@ pub struct Voice {
 /// Who speaks at a corner of blocks.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Corner {
-    voices: [Voice; MAX_VIEWS],
+    voices: [Voice; MAX_WITH_MORE],
     count: usize,
     /// A bit for every member of the ensemble that speaks.
     members: u64,
@@ -60,6 +71,18 @@ impl Corner {
 
     fn has(&self, member: usize) -> bool {
         self.members >> member & 1 != 0
+    }
+
+    /// A member speaks too, not loud.
+    fn add(&mut self, member: usize, view: u16) {
+        if !self.has(member) && self.count < MAX_WITH_MORE {
+            self.voices[self.count] = Voice {
+                view,
+                weight: LEAST_WEIGHT,
+            };
+            self.count += 1;
+            self.members |= 1 << member;
+        }
     }
 }
 
@@ -83,6 +106,8 @@ pub struct CameraBlending {
     samples: Vec<Place>,
     ensemble: Ensemble,
     corners: Vec<Corner>,
+    /// Per block, the members that its single pixels need.
+    additions: Vec<[Option<u8>; MOST_ADDITIONS]>,
 }
 
 impl CameraBlending {
@@ -115,6 +140,37 @@ impl CameraBlending {
             for i in 0..=across {
                 let corner = self.choose_at(scene.grid, views, i, j);
                 self.corners.push(corner);
+            }
+        }
+        self.add_for_pixels(scene, views);
+    }
+
+    /// Between the lobes a view may see no more than a few pixels clean, fewer than a place stands for: what is specular and seen clean by
+    /// nobody who speaks there is asked for pixel by pixel.
+    fn add_for_pixels(&mut self, scene: &Scene<'_>, views: &Views<'_>) {
+        let grid = scene.grid;
+        let across = Self::corners_across(grid);
+        let corners_of = |block: usize| {
+            let first = block / grid.blocks().0 * across + block % grid.blocks().0;
+            [first, first + 1, first + across, first + across + 1]
+        };
+        self.additions.clear();
+        self.additions
+            .resize(grid.blocks().0 * grid.blocks().1, [None; MOST_ADDITIONS]);
+        let (corners, members) = (&self.corners, self.ensemble.members());
+        self.additions.par_iter_mut().enumerate().for_each(|(block, additions)| {
+            let heard = corners_of(block)
+                .into_iter()
+                .fold(0, |all, corner| all | corners[corner].members);
+            if heard != 0 {
+                *additions = needed(scene, views, members, heard, block);
+            }
+        });
+        for (block, additions) in self.additions.iter().enumerate() {
+            for member in additions.iter().flatten() {
+                for corner in corners_of(block) {
+                    self.corners[corner].add(usize::from(*member), self.ensemble.members()[usize::from(*member)]);
+                }
             }
         }
     }
@@ -275,7 +331,7 @@ impl CameraBlending {
         // Buehler 2001: weights fall to zero at a threshold; here beyond the worst view that was needed.
         let threshold = 1.3 * corner.voices().iter().map(|v| v.weight).fold(0.01, f32::max);
         for voice in &mut corner.voices[..corner.count] {
-            voice.weight = (1.0 - voice.weight / threshold).max(0.02);
+            voice.weight = (1.0 - voice.weight / threshold).max(LEAST_WEIGHT);
         }
         corner
     }
@@ -295,6 +351,71 @@ fn transpose(rows: &mut [u64; 64]) {
         side /= 2;
         mask ^= mask << side;
     }
+}
+
+/// The members that see clean what is specular in a block and what none of those who are `heard`, a bit for each, sees clean.
+fn needed(scene: &Scene<'_>, views: &Views<'_>, members: &[u16], heard: u64, block: usize) -> [Option<u8>; MOST_ADDITIONS] {
+    let mut chosen = [None; MOST_ADDITIONS];
+    let side = scene.grid.block();
+    let (left, top) = (block % scene.grid.blocks().0 * side, block / scene.grid.blocks().0 * side);
+    let (mut unseen, mut count) = ([Place::default(); MOST_PIXELS], 0);
+    for y in top..(top + side).min(scene.grid.height) {
+        for x in left..(left + side).min(scene.grid.width) {
+            if scene.distance.at(x, y) == 0 && scene.forbidden.at(x, y) == 0 && count < MOST_PIXELS {
+                let depth = scene.depth_at(x, y);
+                if depth > 0.0 {
+                    unseen[count] = Place {
+                        x: x as f32,
+                        y: y as f32,
+                        depth,
+                    };
+                    count += 1;
+                }
+            }
+        }
+    }
+    let mut rest = 0;
+    for begin in (0..count).step_by(PLACES_AT_ONCE) {
+        let places = &unseen[begin..(begin + PLACES_AT_ONCE).min(count)];
+        let (mut clean, all) = (0, u64::MAX >> (PLACES_AT_ONCE - places.len()));
+        for member in (0..members.len()).filter(|member| heard >> member & 1 != 0) {
+            clean |= views.look(members[member], places).clean;
+            if clean == all {
+                break;
+            }
+        }
+        for k in (0..places.len()).filter(|k| clean >> k & 1 == 0) {
+            unseen[rest] = unseen[begin + k];
+            rest += 1;
+        }
+    }
+    if rest == 0 {
+        return chosen;
+    }
+    // More than can be asked for at once are thinned out.
+    let step = rest.div_ceil(PLACES_AT_ONCE);
+    let mut places = [Place::default(); PLACES_AT_ONCE];
+    let asked = rest.div_ceil(step);
+    for (place, unseen) in places.iter_mut().zip(unseen[..rest].iter().step_by(step)) {
+        *place = *unseen;
+    }
+    let places = &places[..asked];
+    let mut clean = [0_u64; MOST_MEMBERS];
+    for member in (0..members.len()).filter(|member| heard >> member & 1 == 0) {
+        clean[member] = views.look(members[member], places).clean;
+    }
+    let mut wanted = u64::MAX >> (PLACES_AT_ONCE - asked);
+    for chosen in &mut chosen {
+        let worth =
+            |member: usize| (clean[member] & wanted).count_ones() as f32 / (0.1 + views.penalty(members[member], places[0]));
+        let best = (0..members.len()).max_by(|&a, &b| worth(a).total_cmp(&worth(b)));
+        let Some(best) = best.filter(|&best| worth(best) > 0.0) else {
+            break;
+        };
+        *chosen = Some(best as u8);
+        wanted &= !clean[best];
+    }
+    chosen
 }
 
 /// The pixel that stands for a square.
@@ -352,7 +473,7 @@ fn places_around(grid: Grid, i: usize, j: usize) -> impl Iterator<Item = usize> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::stages::specularity_substitution::example::{Example, HOLE};
+    use crate::stages::specularity_substitution::example::{DEPTH, Example, HOLE};
     use crate::stages::specularity_substitution::live::Live;
 
     /// Voices at the corner nearest to the hole's middle.
@@ -393,6 +514,32 @@ mod tests {
         // All see the hole equally well, so the angle decides; three sightings are enough.
         assert_eq!(voices.iter().map(|v| v.view).collect::<Vec<_>>(), [0, 1, 2]);
         assert!(voices.windows(2).all(|pair| pair[0].weight > pair[1].weight), "{voices:?}");
+    }
+
+    #[test]
+    fn a_block_has_no_more_pixels_than_are_kept() {
+        for width in 320..1440 {
+            let side = Grid::over((width, width / 2)).block();
+            assert!(side * side <= MOST_PIXELS, "{width}");
+        }
+    }
+
+    #[test]
+    fn a_single_pixel_that_one_far_view_sees_clean_makes_it_speak() {
+        let moves: Vec<_> = (0..5).map(|i| (1.0 + i as f32, 0.0)).chain([(0.0, 15.0)]).collect();
+        for at in 0..16 {
+            let place = (HOLE.0 + at % 4, HOLE.1 + at / 4);
+            let mut example = Example::new(&moves, [1.0; 3], (0.0, 0.0));
+            let vantages = example.vantages();
+            for (view, vantage) in vantages.iter().enumerate().take(5) {
+                let (u, v, _) = vantage.unwrap().mapping.apply(place.0 as f32, place.1 as f32, DEPTH);
+                let confidence = &mut example.light_field.views[view].confidence;
+                confidence.set((u + 0.5) as usize, (v + 0.5) as usize, 0);
+            }
+            example.look_again();
+            let voices = voices(&example);
+            assert!(voices.iter().any(|v| v.view == 5), "{place:?}: {voices:?}");
+        }
     }
 
     #[test]
