@@ -4,6 +4,8 @@
 //! depth: above [`WORKING_WIDTH_PX`] looking at every pixel costs much and shows little more. The picture itself keeps its size: what was
 //! found is carried back.
 
+use std::ops::Range;
+
 use rayon::prelude::*;
 
 use crate::image::buffer::{Image, Mask, Rgb8};
@@ -12,9 +14,14 @@ use crate::image::wide;
 /// Pictures are looked at at about this width, px.
 const WORKING_WIDTH_PX: f32 = 960.0;
 
-/// Picture pixels along a pixel of the reduced picture.
+/// Picture pixels along a pixel of the picture as it is looked at.
 pub fn reduction_for(width: usize) -> usize {
-    (width as f32 / WORKING_WIDTH_PX).round().max(1.0) as usize
+    reduction_to(width, WORKING_WIDTH_PX)
+}
+
+/// By how much a picture is reduced for a width of about `wanted_px`.
+pub fn reduction_to(width: usize, wanted_px: f32) -> usize {
+    (width as f32 / wanted_px).round().max(1.0) as usize
 }
 
 /// Size of a picture reduced by `step`, squares cut off by its right and lower border counted.
@@ -74,18 +81,30 @@ impl wide::Kernel for MeanOfPairs<'_> {
 
 /// Reduced pixels from (x, y) on.
 fn mean_of_lines(image: &Image<Rgb8>, (x, y): (usize, usize), step: usize, out: &mut [Rgb8]) {
+    let rows = y * step..((y + 1) * step).min(image.height());
     for (x, out) in (x..).zip(out) {
-        let (mut sum, mut count) = ([0_u32; 3], 0);
-        for v in y * step..((y + 1) * step).min(image.height()) {
-            for pixel in &image.row(v)[x * step..((x + 1) * step).min(image.width())] {
-                for (sum, &channel) in sum.iter_mut().zip(pixel) {
-                    *sum += u32::from(channel);
-                }
-                count += 1;
+        *out = mean_of(image, x * step..((x + 1) * step).min(image.width()), rows.clone());
+    }
+}
+
+/// Mean color of a rectangle, rounded to the nearest level.
+pub fn mean_of(image: &Image<Rgb8>, columns: Range<usize>, rows: Range<usize>) -> Rgb8 {
+    let count = (columns.len() * rows.len()).max(1) as u32;
+    sum_of(image, columns, rows).map(|sum| ((sum + count / 2) / count) as u8)
+}
+
+/// Sum of the colors of a rectangle.
+#[inline(always)]
+pub fn sum_of(image: &Image<Rgb8>, columns: Range<usize>, rows: Range<usize>) -> [u32; 3] {
+    let mut sum = [0; 3];
+    for y in rows {
+        for pixel in &image.row(y)[columns.clone()] {
+            for c in 0..3 {
+                sum[c] += u32::from(pixel[c]);
             }
         }
-        *out = sum.map(|s| ((s + count / 2) / count.max(1)) as u8);
     }
+    sum
 }
 
 /// The least value of each square: a square is inside only if all of it is.

@@ -16,7 +16,12 @@ const SILENT_PX: f32 = 4.0;
 /// Full voice from this distance on.
 const FULL_PX: f32 = 9.0;
 /// Darker than this in every channel is the endoscope's black surround, not tissue.
-pub(super) const BLACK: u8 = 10;
+const BLACK: u8 = 10;
+
+/// True for a colour of the endoscope's black surround.
+pub(super) fn is_black(pixel: Rgb8) -> bool {
+    pixel.iter().all(|&level| level < BLACK)
+}
 
 /// 0 on specularities, out of the image field and in the black; a ramp around them; 255 elsewhere. `field` is 0 out of the
 /// image field.
@@ -37,7 +42,7 @@ pub fn confidence_of(image: &Image<Rgb8>, field: &Mask) -> Mask {
             // What is replaced by a view must never be steel, and a view is one of many: either test silences it.
             let marked = shining.pixels()[i] != 0 || steel.pixels()[i] != 0;
             let specular = marked || dark[i] > surroundings[i] + RISE_LEVELS || pixel.iter().all(|&v| v >= CLIPPED);
-            let outside = field.pixels()[i] == 0 || pixel.iter().all(|&v| v < BLACK);
+            let outside = field.pixels()[i] == 0 || is_black(pixel);
             if specular || outside { 0.0 } else { 1e6 }
         })
         .collect();

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 use crate::image::hole_filling::HoleFiller;
-use crate::light_field::confidence::BLACK;
+use crate::light_field::confidence::is_black;
 use crate::light_field::lamp_share::{Tissue, difference};
 use crate::light_field::mapping::{Mapping, is_unoccluded};
 use crate::light_field::view::{LampShading, LightField, View};
@@ -132,10 +132,7 @@ fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), 
 /// 255 on black pixels and near them.
 fn surround(image: &Image<Rgb8>) -> Mask {
     let (width, height) = image.size();
-    let black = image
-        .pixels()
-        .iter()
-        .map(|pixel| if pixel.iter().all(|&level| level < BLACK) { 255 } else { 0 });
+    let black = image.pixels().iter().map(|&pixel| if is_black(pixel) { 255 } else { 0 });
     let Some(mut mask) = Image::from_vec(width, height, black.collect()) else {
         return Image::filled(width, height, 0);
     };

@@ -9,7 +9,7 @@ pub struct StageOutcome {
     pub name: &'static str,
     /// Time in the stage, per frame that it treated.
     pub working: Durations,
-    /// Time between the stage before and this one, per frame.
+    /// Time between the stage before and this one, until a core was free, per frame.
     pub waiting: Durations,
     /// Frames that it failed on and that went on as they came.
     pub failures: u64,

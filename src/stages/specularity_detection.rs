@@ -75,3 +75,50 @@ impl Stage for SpecularityDetection {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::frame::FrameId;
+    use crate::image::buffer::Image;
+    use crate::time::Timestamp;
+
+    /// A frame of plain tissue with one clipped droplet at `place`, a part of the left side out of the field.
+    fn frame((width, height): (usize, usize), place: (usize, usize)) -> Frame {
+        let mut image = Pool::new(1).take(width, height);
+        image.fill([150, 70, 60]);
+        for y in place.1 - 8..place.1 + 8 {
+            image.row_mut(y)[place.0 - 8..place.0 + 8].fill([255; 3]);
+        }
+        let mut field = Image::filled(width, height, 255);
+        for y in 0..height {
+            field.row_mut(y)[..101].fill(0);
+        }
+        let mut frame = Frame::new(FrameId(0), Timestamp(0), Timestamp(0), image);
+        frame.field_of_view = Some(Arc::new(field));
+        frame
+    }
+
+    #[test]
+    fn wide_pictures_are_looked_at_reduced_and_others_as_they_are() {
+        for (size, step) in [((960, 540), 1), ((1280, 720), 1), ((1919, 1079), 2), ((2879, 1619), 3)] {
+            let place = (size.0 / 2, size.1 / 2);
+            let mut frame = frame(size, place);
+            let mut stage = SpecularityDetection::new(&Settings::default());
+            stage.process(&mut frame).unwrap();
+            let seen = frame.analysis.as_ref().unwrap();
+            let reduced = (size.0.div_ceil(step), size.1.div_ceil(step));
+            assert_eq!((seen.step, seen.image(&frame.image).size()), (step, reduced));
+            assert_eq!((seen.specularities.size(), seen.instruments.size()), (reduced, reduced));
+            assert_eq!(seen.specularities.at(place.0 / step, place.1 / step), 255, "at {size:?}");
+            let field = seen.field_of_view.as_ref().unwrap();
+            // Column 100 is outside, and with it the square it lies in.
+            assert_eq!((field.at(100 / step, 9), field.at(100 / step + 1, 9)), (0, 255));
+            // The same field is not reduced again.
+            let before = Arc::clone(field);
+            stage.process(&mut frame).unwrap();
+            let again = frame.analysis.as_ref().and_then(|seen| seen.field_of_view.as_ref());
+            assert!(Arc::ptr_eq(&before, again.unwrap()));
+        }
+    }
+}

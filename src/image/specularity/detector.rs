@@ -159,39 +159,37 @@ impl SpecularityDetector {
                 *cores += self.cores.pixels()[pixels.clone()].iter().filter(|core| **core != 0).count() as u32;
             }
             if is_large(run.label as usize) {
-                let is_clipped = |color: &&Rgb8| color.iter().all(|level| *level >= NEARLY_CLIPPED_LEVEL);
-                *clipped += image.pixels()[pixels].iter().filter(is_clipped).count() as u32;
+                *clipped += image.pixels()[pixels].iter().filter(|color| is_nearly_clipped(color)).count() as u32;
             }
         }
-        let counts = &self.counts;
-        let is_core = |label: usize| counts[label][0] >= MIN_CORE_PX;
-        let is_plausible =
-            |label: usize, area: u32| !is_large(label) || counts[label][1] as f32 > MIN_CLIPPED_SHARE * area as f32;
-        self.components.paint(specular, 255, |label, region| {
-            is_core(label) && is_plausible(label, region.area)
-        });
+        let has_core = |label: usize| self.counts[label][0] >= MIN_CORE_PX;
+        let is_plausible = |label: usize| {
+            !is_large(label) || self.counts[label][1] as f32 > MIN_CLIPPED_SHARE * self.components.regions()[label].area as f32
+        };
+        self.components
+            .paint(specular, 255, |label, _| has_core(label) && is_plausible(label));
         // Of what is too large to be one specularity, a droplet on pale tissue or a cluster whose halos flow together, only what lies
         // around clipped pixels is the lamp's for sure.
         let around = (AROUND_CLIPPED_PX * width as f32 / REFERENCE_WIDTH_PX).round() as usize;
-        for run in self.components.runs() {
-            let (label, area) = (run.label as usize, self.components.regions()[run.label as usize].area);
-            if is_plausible(label, area) || !is_core(label) {
-                continue;
-            }
+        let runs = self.components.runs().iter();
+        for run in runs.filter(|run| has_core(run.label as usize) && !is_plausible(run.label as usize)) {
             let y = run.y as usize;
-            for x in run.begin as usize..run.end as usize {
-                if image.at(x, y).iter().all(|level| *level >= NEARLY_CLIPPED_LEVEL) {
-                    for v in y.saturating_sub(around)..(y + around + 1).min(height) {
-                        let columns = x.saturating_sub(around)..(x + around + 1).min(width);
-                        let halos = &self.halos.row(v)[columns.clone()];
-                        for (specular, &halo) in specular.row_mut(v)[columns].iter_mut().zip(halos) {
-                            *specular |= halo;
-                        }
+            let columns = run.begin as usize..run.end as usize;
+            for x in columns.filter(|&x| is_nearly_clipped(&image.at(x, y))) {
+                let near = x.saturating_sub(around)..(x + around + 1).min(width);
+                for v in y.saturating_sub(around)..(y + around + 1).min(height) {
+                    let halos = &self.halos.row(v)[near.clone()];
+                    for (specular, &halo) in specular.row_mut(v)[near.clone()].iter_mut().zip(halos) {
+                        *specular |= halo;
                     }
                 }
             }
         }
     }
+}
+
+fn is_nearly_clipped(color: &Rgb8) -> bool {
+    color.iter().all(|&level| level >= NEARLY_CLIPPED_LEVEL)
 }
 
 /// 255 in `near` for each of the `core_cells`, of `step` px, that has a core.
@@ -366,6 +364,39 @@ mod tests {
             .filter(|&(x, y)| inside(x, y) && specular.at(x, y) != 0)
             .count();
         assert!(marked * 50 < 70 * 60 * 3, "{marked} px of a pale organ");
+    }
+
+    #[test]
+    fn of_a_cluster_too_large_the_clipped_droplets_are_found_and_the_gleam_between_is_left() {
+        let mut image = tissue(1.0);
+        // A long faint gleam joins the droplets.
+        for y in 120..132 {
+            for x in 160..320 {
+                image.set(x, y, image.at(x, y).map(|level| level.saturating_add(60)));
+            }
+        }
+        let droplets = [180, 215, 250, 285].map(|x| (x, 126));
+        for (x, y) in droplets {
+            shine(&mut image, x as f32, y as f32, 3.0, 255.0);
+        }
+        let (specular, _) = detect(&image);
+        for (x, y) in droplets {
+            assert_eq!(specular.at(x, y), 255, "droplet at ({x}, {y})");
+        }
+        let found = specular.pixels().iter().filter(|mark| **mark != 0).count();
+        // At half the reference width: a clipped disc of 3 px and 2 px to each side.
+        assert!(found <= droplets.len() * 11 * 11, "{found} px");
+        let settings = Settings {
+            max_region_share: 1.0,
+            ..Settings::default()
+        };
+        let (mut all, mut steel) = (Image::filled(0, 0, 0), Image::filled(0, 0, 0));
+        SpecularityDetector::new(&settings).detect(&image, None, &mut all, &mut steel);
+        let joined = all.pixels().iter().filter(|mark| **mark != 0).count();
+        assert!(
+            joined as f32 > Settings::default().max_region_share * (WIDTH * HEIGHT) as f32,
+            "{joined} px are no large region"
+        );
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The frame in cells: sums over cells, smoothed, are the fields that the substitution carries into its holes.
 
+use crate::image::reduction::reduction_to;
 use crate::image::wide;
 
 /// The ring around a hole is looked at in a picture of about this width, px.
@@ -138,7 +139,7 @@ impl Grid {
 
 /// Pixels of a picture of this width along a pixel of its small one.
 pub fn step_for(width: usize) -> usize {
-    (width as f32 / SMALL_WIDTH_PX).round().max(1.0) as usize
+    reduction_to(width, SMALL_WIDTH_PX)
 }
 
 /// A rectangle of blocks.

@@ -5,6 +5,7 @@ use std::ops::Range;
 use rayon::prelude::*;
 
 use crate::image::color::luma;
+use crate::image::reduction::sum_of;
 use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Smoother, Span, Sums};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::tile::Tile;
@@ -206,14 +207,7 @@ fn look_at_row(scene: &Scene<'_>, row: usize, pixels: &mut [SmallPixel], holes: 
         if distance <= scene.guard || distance > scene.ring || scene.forbidden.at(x, y) != 0 {
             continue;
         }
-        let mut sum = [0_u32; 3];
-        for v in top..top + step {
-            for source in &scene.image.row(v)[left..left + step] {
-                for (sum, &channel) in sum.iter_mut().zip(source) {
-                    *sum += u32::from(channel);
-                }
-            }
-        }
+        let sum = sum_of(scene.image, left..left + step, top..top + step);
         let count = (step * step) as f32;
         pixel.color = sum.map(|s| s as f32 / count);
         if pixel.color.iter().any(|&c| c < 250.0) {

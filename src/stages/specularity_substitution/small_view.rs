@@ -1,5 +1,6 @@
 //! A view small enough that looking at a few pixels of every block does not alias.
 
+use crate::image::reduction::mean_of;
 use crate::image::wide;
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::grid::{Division, step_for};
@@ -131,17 +132,11 @@ impl SmallView {
 
 /// The mean of a square of a view's pixels.
 fn small_pixel(view: &View, step: usize, x: usize, y: usize) -> SmallPixel {
-    let (mut sum, mut confidence, mut count) = ([0_u32; 3], 255, 0);
-    for v in y * step..((y + 1) * step).min(view.image.height()) {
-        for u in x * step..((x + 1) * step).min(view.image.width()) {
-            for (sum, channel) in sum.iter_mut().zip(view.image.at(u, v)) {
-                *sum += u32::from(channel);
-            }
-            confidence = view.confidence.at(u, v).min(confidence);
-            count += 1;
-        }
-    }
-    let [r, g, b] = sum.map(|s| ((s + count / 2) / count.max(1)) as u8);
+    let columns = x * step..((x + 1) * step).min(view.image.width());
+    let rows = y * step..((y + 1) * step).min(view.image.height());
+    let confidences = rows.clone().flat_map(|v| &view.confidence.row(v)[columns.clone()]);
+    let confidence = confidences.fold(255, |least, &confidence| confidence.min(least));
+    let [r, g, b] = mean_of(&view.image, columns, rows);
     let middle = |at: usize, end: usize| (at * step + step / 2).min(end - 1);
     SmallPixel {
         color: [r, g, b, confidence],

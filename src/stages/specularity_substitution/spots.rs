@@ -2,6 +2,7 @@
 
 use crate::image::buffer::Rgb8;
 use crate::image::color::luma;
+use crate::image::reduction::sum_of;
 use crate::image::wide;
 use crate::light_field::mapping::is_unoccluded;
 use crate::stages::specularity_substitution::grid::{SMALL_PER_BLOCK, SMALL_PER_CELL, Sums};
@@ -184,18 +185,13 @@ fn look_at_small(
     if left >= right || top >= bottom {
         return Look::Nothing;
     }
-    let (mut nearest, mut forbidden, mut sum) = (u16::MAX, 0, [0_u32; 3]);
+    let (mut nearest, mut forbidden) = (u16::MAX, 0);
     for y in top..bottom {
         for &distance in &scene.distance.row(y)[left..right] {
             nearest = nearest.min(distance);
         }
         for &mark in &scene.forbidden.row(y)[left..right] {
             forbidden |= mark;
-        }
-        for pixel in &scene.image.row(y)[left..right] {
-            for c in 0..3 {
-                sum[c] += u32::from(pixel[c]);
-            }
         }
     }
     if nearest > scene.reach {
@@ -205,6 +201,7 @@ fn look_at_small(
     if nearest == 0 || forbidden != 0 || left + step > grid.width || top + step > grid.height {
         return Look::Doubtful;
     }
+    let sum = sum_of(scene.image, left..right, top..bottom);
     let live = luma([sum[0] as f32, sum[1] as f32, sum[2] as f32]) / (step * step) as f32;
     match expected_at(scene, chosen, asked, block, (left + step / 2, top + step / 2)) {
         Some(expected) if live <= expected + PLAIN_LEVELS => Look::Plain(Plain {

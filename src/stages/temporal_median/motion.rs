@@ -296,20 +296,25 @@ mod tests {
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
 
+    /// Differences above 30 levels are outliers.
+    fn stats_of(newest: &[u8], older: [&[u8]; LAGS], width: usize) -> Vec<BlockStats> {
+        let mut stats = vec![BlockStats::default(); width.div_ceil(BLOCK)];
+        wide::run(BlockRow {
+            newest,
+            older,
+            width,
+            inlier_bound: 30,
+            stats: &mut stats,
+        });
+        stats
+    }
+
     #[test]
     fn texture_agrees_with_plain_sums() {
         let mut random = ChaCha8Rng::seed_from_u64(4);
         for (width, rows) in [(41_usize, 13_usize), (64, 16), (133, 16), (17, 3)] {
             let gray: Vec<u8> = (0..width * rows).map(|_| random.random()).collect();
-            let mut stats = vec![BlockStats::default(); width.div_ceil(BLOCK)];
-            wide::run(BlockRow {
-                newest: &gray,
-                older: [&gray, &gray],
-                width,
-                inlier_bound: 30,
-                stats: &mut stats,
-            });
-            for (index, stats) in stats.iter().enumerate() {
+            for (index, stats) in stats_of(&gray, [&gray, &gray], width).iter().enumerate() {
                 let (left, right) = (index * BLOCK, (index * BLOCK + BLOCK).min(width));
                 let (mut level, mut second, mut central, mut all) = (0, 0, 0, 0);
                 for y in (0..rows).step_by(2) {
@@ -336,15 +341,7 @@ mod tests {
         let (width, rows) = (141, 13);
         let mut plane = || (0..width * rows).map(|_| random.random_range(80..150)).collect::<Vec<u8>>();
         let (newest, middle, oldest) = (plane(), plane(), plane());
-        let mut stats = vec![BlockStats::default(); 9];
-        wide::run(BlockRow {
-            newest: &newest,
-            older: [&middle, &oldest],
-            width,
-            inlier_bound: 30,
-            stats: &mut stats,
-        });
-        for (index, stats) in stats.iter().enumerate() {
+        for (index, stats) in stats_of(&newest, [&middle, &oldest], width).iter().enumerate() {
             for (lag, older) in [&middle, &oldest].into_iter().enumerate() {
                 let (mut squares, mut sum, mut inliers) = (0, 0, 0);
                 for y in 0..rows {
