@@ -4,7 +4,8 @@
 //!
 //! 0. [`support`]: where the surface is known, and what may be filled of it;
 //! 1. [`ensemble`] and [`camera_blending`]: which views looked at the same tissue, best by the unstructured-lumigraph penalties and by
-//!    how much of the hole they saw free of the lamp, chosen at the corners of blocks and blended in between (Buehler et al. 2001);
+//!    how much of the hole they saw free of the lamp, chosen at the corners of blocks and blended in between (Buehler et al. 2001),
+//!    and [`single_pixels`]: who is needed besides for what the chosen see clean nowhere;
 //! 2. [`live`] and [`view_fit`]: each of these views, drawn small over the good pixels around the holes, gives its brightness against
 //!    the live picture (the lamp rides on the camera, so views differ from place to place), the small shift that is left, and how
 //!    well it then fits: three smooth fields by normalized convolution (Knutsson and Westin 1993);
@@ -29,6 +30,7 @@ mod replacement;
 pub mod scene;
 pub mod settings;
 pub mod sight;
+pub mod single_pixels;
 pub mod small_view;
 pub mod speaker;
 pub mod spots;
