@@ -33,8 +33,10 @@ const LEAST_GAIN: u32 = 3;
 /// A view as pairing sees it.
 #[derive(Debug)]
 pub struct Station {
-    world_from_camera: Transform<World, Camera>,
+    camera_from_world: Transform<Camera, World>,
     camera: CameraModel,
+    /// The optical centre.
+    center: Vector3<f64>,
     /// What it looks at.
     aim: Vector3<f64>,
     /// Places of its picture, at the same depth.
@@ -51,20 +53,17 @@ impl Station {
             (world_from_camera * local).coords
         };
         Self {
-            world_from_camera,
+            camera_from_world: world_from_camera.inverse(),
             camera: camera.clone(),
+            center: world_from_camera.translation(),
             aim: (world_from_camera * Point::from_coords(Vector3::new(0.0, 0.0, depth))).coords,
             places: ROWS.into_iter().flat_map(|y| COLUMNS.map(|x| at(x, y))).collect(),
         }
     }
 
-    fn center(&self) -> Vector3<f64> {
-        self.world_from_camera.translation()
-    }
-
     /// Whether `place` lies in the picture, farther from its border than a share of its size.
     fn sees(&self, place: &Vector3<f64>, border: f64) -> bool {
-        let local = self.world_from_camera.inverse() * Point::from_coords(*place);
+        let local = self.camera_from_world * Point::from_coords(*place);
         let (width, height) = (self.camera.width as f64, self.camera.height as f64);
         self.camera.project(local).is_some_and(|pixel| {
             let (x, y) = (pixel.x / width, pixel.y / height);
@@ -87,7 +86,7 @@ impl Station {
 
     /// Logarithms of the angle over the best one, and of the distances' ratio.
     fn apart(&self, other: &Self, place: &Vector3<f64>, best_angle_rad: f64) -> (f64, f64) {
-        let (from, to) = (self.center() - place, other.center() - place);
+        let (from, to) = (self.center - place, other.center - place);
         let off = (from.angle(&to).max(1e-6) / best_angle_rad).ln();
         (off, (from.norm() / to.norm()).ln())
     }
@@ -96,7 +95,14 @@ impl Station {
 /// Views that cover the survey evenly: farthest-point sampling over where they stand and where they look; then some more for what these
 /// do not see.
 pub fn references(stations: &[Station], count: usize) -> Vec<usize> {
-    let places: Vec<Vector3<f64>> = stations.iter().map(|s| s.center() + s.aim * 0.5).collect();
+    let mut chosen = evenly_spread(stations, count);
+    complete_references(stations, &mut chosen);
+    chosen.sort_unstable();
+    chosen
+}
+
+fn evenly_spread(stations: &[Station], count: usize) -> Vec<usize> {
+    let places: Vec<Vector3<f64>> = stations.iter().map(|s| s.center + s.aim * 0.5).collect();
     let mut chosen = vec![places.len() / 2];
     let mut distance: Vec<f64> = vec![f64::INFINITY; places.len()];
     while chosen.len() < count.min(places.len()) {
@@ -111,6 +117,11 @@ pub fn references(stations: &[Station], count: usize) -> Vec<usize> {
     }
     chosen.sort_unstable();
     chosen.dedup();
+    chosen
+}
+
+/// Add the views that see most of what fewer than two of the chosen see.
+fn complete_references(stations: &[Station], chosen: &mut Vec<usize>) {
     let most = chosen.len() + (chosen.len() as f64 * MORE_MAPS).ceil() as usize;
     // Per view, per place of any view: whether it sees it.
     let seen: Vec<Vec<bool>> = (stations.iter())
@@ -125,11 +136,8 @@ pub fn references(stations: &[Station], count: usize) -> Vec<usize> {
         .collect();
     while chosen.len() < most {
         let gain = |view: &usize| -> u32 {
-            let newly = seen[*view]
-                .iter()
-                .zip(&maps)
-                .filter(|(seen, maps)| **seen && **maps < WANTED_MAPS);
-            newly.count() as u32
+            let places = seen[*view].iter().zip(&maps);
+            places.filter(|(seen, maps)| **seen && **maps < WANTED_MAPS).count() as u32
         };
         let rest = (0..stations.len()).filter(|view| !chosen.contains(view));
         let Some(best) = rest.max_by_key(|view| gain(view)).filter(|view| gain(view) >= LEAST_GAIN) else {
@@ -140,18 +148,22 @@ pub fn references(stations: &[Station], count: usize) -> Vec<usize> {
         }
         chosen.push(best);
     }
-    chosen.sort_unstable();
-    chosen
 }
 
 /// Whom a view is matched with: `count` near the best angle, at a like distance, and from different sides; then some more for what these
 /// do not see.
 pub fn neighbours(stations: &[Station], view: usize, count: usize, best_angle_rad: f64) -> Vec<usize> {
+    let mut chosen = around_the_aim(stations, view, count, best_angle_rad);
+    complete_neighbours(stations, view, best_angle_rad, &mut chosen);
+    chosen
+}
+
+fn around_the_aim(stations: &[Station], view: usize, count: usize, best_angle_rad: f64) -> Vec<usize> {
     let own = &stations[view];
     let mut scored: Vec<(f64, usize, Vector3<f64>)> = (stations.iter().enumerate())
         .filter(|&(other, station)| other != view && station.sees(&own.aim, AIM_BORDER))
         .filter_map(|(other, station)| {
-            let side = (station.center() - own.center()).try_normalize(1e-9)?;
+            let side = (station.center - own.center).try_normalize(1e-9)?;
             Some((own.worth(station, &own.aim, best_angle_rad), other, side))
         })
         .collect();
@@ -169,6 +181,12 @@ pub fn neighbours(stations: &[Station], view: usize, count: usize, best_angle_ra
             *score *= 1.0 - 0.8 * direction.dot(&side).max(0.0).powi(2);
         }
     }
+    chosen
+}
+
+/// Add the partners that are worth most for the places for which the chosen are not worth enough.
+fn complete_neighbours(stations: &[Station], view: usize, best_angle_rad: f64, chosen: &mut Vec<usize>) {
+    let own = &stations[view];
     let worth = |other: usize| -> Vec<f64> {
         let station: &Station = &stations[other];
         let worth = |place| {
@@ -181,7 +199,7 @@ pub fn neighbours(stations: &[Station], view: usize, count: usize, best_angle_ra
         own.places.iter().map(worth).collect()
     };
     let mut sum = vec![0.0; own.places.len()];
-    for &other in &chosen {
+    for &other in &*chosen {
         sum.iter_mut().zip(worth(other)).for_each(|(sum, worth)| *sum += worth);
     }
     let mut rest: Vec<(usize, Vec<f64>)> = (0..stations.len())
@@ -203,7 +221,6 @@ pub fn neighbours(stations: &[Station], view: usize, count: usize, best_angle_ra
         sum.iter_mut().zip(worth).for_each(|(sum, worth)| *sum += worth);
         chosen.push(other);
     }
-    chosen
 }
 
 #[cfg(test)]

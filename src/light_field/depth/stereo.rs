@@ -23,9 +23,9 @@ const GUESS_COST: f32 = 0.5;
 #[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct StereoSettings {
-    /// Views that get a depth map of their own; the surface serves the rest.
+    /// Views that get a depth map of their own, and some more where these leave gaps; the surface serves the rest.
     pub reference_views: usize,
-    /// Views each of them is matched with.
+    /// Views each of them is matched with, and some more for places that these do not see.
     pub neighbours: usize,
     /// Angle at the scene at which two views match best, rad: wider resolves depth better, narrower looks more alike.
     pub best_angle_rad: f64,

@@ -143,28 +143,24 @@ impl CameraBlending {
     /// Between the lobes a view may see no more than a few pixels clean, fewer than a place stands for: what is specular and seen clean by
     /// nobody who speaks there is asked for pixel by pixel.
     fn add_for_pixels(&mut self, scene: &Scene<'_>, views: &Views<'_>) {
-        let grid = scene.grid;
-        let across = Self::corners_across(grid);
-        let corners_of = |block: usize| {
-            let first = block / grid.blocks().0 * across + block % grid.blocks().0;
-            [first, first + 1, first + across, first + across + 1]
-        };
+        let (blocks, rows) = scene.grid.blocks();
+        let across = Self::corners_across(scene.grid);
+        let corners_of = |(i, j): (usize, usize)| [0, 1, across, across + 1].map(|step| j * across + i + step);
+        let members = self.ensemble.members();
         self.additions.clear();
-        self.additions
-            .resize(grid.blocks().0 * grid.blocks().1, [None; MOST_ADDITIONS]);
-        let (corners, members) = (&self.corners, self.ensemble.members());
-        self.additions.par_iter_mut().enumerate().for_each(|(block, additions)| {
-            let heard = corners_of(block)
-                .into_iter()
-                .fold(0, |all, corner| all | corners[corner].members);
+        self.additions.resize(blocks * rows, [None; MOST_ADDITIONS]);
+        let corners = &self.corners;
+        self.additions.par_iter_mut().enumerate().for_each(|(index, additions)| {
+            let block = (index % blocks, index / blocks);
+            let heard = corners_of(block).iter().fold(0, |all, &corner| all | corners[corner].members);
             if heard != 0 {
-                *additions = needed(scene, views, members, heard, block);
+                *additions = needed(scene, views, (members, heard), block);
             }
         });
-        for (block, additions) in self.additions.iter().enumerate() {
-            for member in additions.iter().flatten() {
-                for corner in corners_of(block) {
-                    self.corners[corner].add(usize::from(*member), self.ensemble.members()[usize::from(*member)]);
+        for (index, additions) in self.additions.iter().enumerate() {
+            for member in additions.iter().flatten().map(|&member| usize::from(member)) {
+                for corner in corners_of((index % blocks, index / blocks)) {
+                    self.corners[corner].add(member, members[member]);
                 }
             }
         }
