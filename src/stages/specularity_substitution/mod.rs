@@ -12,12 +12,13 @@
 //! 3. [`blend`], [`drawing`] and [`drawn`]: the views drawn in full over the holes, [`lookup`] by [`lookup`], and blended, the darker
 //!    heard rather than the brighter, since the lamp only adds light;
 //! 4. [`replacement`]: the picture replaced where it is *brighter* than what was measured: the seam lies where both agree, so it
-//!    cannot be seen.
+//!    cannot be seen; [`cut_patches`] are left whole where it would be.
 //!
 //! Where no view fits, the picture is left as it was, and says so.
 
 pub mod blend;
 pub mod camera_blending;
+mod cut_patches;
 pub mod drawing;
 pub mod drawn;
 pub mod ensemble;

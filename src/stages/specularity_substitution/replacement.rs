@@ -9,6 +9,7 @@ use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::components::set_runs;
 use crate::image::wide;
 use crate::stages::specularity_substitution::blend::{Canvas, PLAIN};
+use crate::stages::specularity_substitution::cut_patches::CutPatches;
 use crate::stages::specularity_substitution::grid::Grid;
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
@@ -47,6 +48,7 @@ pub struct Shares {
     own: Image<u8>,
     /// The most of a pixel and those around it.
     around: Image<u8>,
+    cut_patches: CutPatches,
 }
 
 impl Default for Shares {
@@ -54,6 +56,7 @@ impl Default for Shares {
         Self {
             own: Image::filled(0, 0, 0),
             around: Image::filled(0, 0, 0),
+            cut_patches: CutPatches::default(),
         }
     }
 }
@@ -83,6 +86,7 @@ impl Shares {
                 }
             }
         });
+        self.cut_patches.leave(scene, canvas, &mut self.own, TISSUE + 1);
         self.look_around();
     }
 
