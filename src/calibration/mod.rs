@@ -1,0 +1,3 @@
+//! Calibration: what a camera is, how it sits on the arm, how far the clocks are apart, and what its colours mean; each with its errors.
+
+pub mod hand_eye;
