@@ -1,3 +1,4 @@
 //! Calibration: what a camera is, how it sits on the arm, how far the clocks are apart, and what its colours mean; each with its errors.
 
 pub mod hand_eye;
+pub mod time_offset;
