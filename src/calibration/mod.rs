@@ -1,0 +1,23 @@
+//! Calibration: cameras from pictures of a board.
+
+pub mod board;
+pub mod charuco;
+pub mod checkerboard;
+pub mod circles;
+pub mod corner_fit;
+pub mod coverage;
+pub mod cross_validation;
+pub mod detection;
+pub mod error;
+pub mod homography;
+pub mod lattice;
+pub mod lens;
+pub mod marker;
+pub mod marker_tables;
+pub mod placement;
+pub mod plot;
+pub mod pose;
+pub mod refine;
+pub mod report;
+pub mod saddle;
+pub mod zhang;
