@@ -1,7 +1,7 @@
 //! endofield: endoscope video, clearer than the endoscope saw it, a moment later, always.
 
-pub mod camera;
 pub mod calibration;
+pub mod camera;
 pub mod cli;
 pub mod compose;
 pub mod config;

@@ -2,8 +2,8 @@
 //!
 //! Written `KIND:COLUMNSxROWS[:…]`:
 //! - `checkerboard:9x6` counts *inner* corners, as OpenCV does: where four squares meet.
-//! - `charuco:19x26:4[:4x4_250]` counts *squares*; the number is the side of a marker in mm, then the dictionary. Whether the first
-//!   square bears a marker (as in OpenCV's "legacy" boards of an even number of rows) or not is found from the picture.
+//! - `charuco:19x26:4[:4x4_250[:legacy]]` counts *squares*; the number is the side of a marker in mm, then the dictionary. The first
+//!   square is black; on OpenCV's "legacy" boards of an even number of rows it bears the first marker.
 //! - `circles:7x5[:2.5]` is a grid of dots; the number is a dot's diameter in mm (measured from the picture if left out).
 //! - `acircles:4x11[:2.5]` is OpenCV's asymmetric grid: 11 rows of 4 dots, every other row shifted by half a distance. The square is
 //!   half the distance of two dots in a row: dot j of row i lies at ((2j + i mod 2)·S, i·S).
@@ -31,6 +31,8 @@ pub enum Pattern {
         marker_mm: f64,
         /// Which markers.
         dictionary: Dictionary,
+        /// Printed by OpenCV before 4.6 (or with its legacy pattern): an even number of rows begins with a marker.
+        legacy: bool,
     },
     /// Dots in rows and columns.
     Circles {
@@ -95,7 +97,9 @@ impl BoardLayout {
         let length = |part: Option<&str>, what: &str| -> Result<Option<f64>, BoardError> {
             part.map(|part| match part.parse::<f64>() {
                 Ok(mm) if mm > 0.0 && mm < 2.0 * square_mm => Ok(mm),
-                _ => Err(BoardError(format!("expected {what} in mm that fits the board, found `{part}`"))),
+                _ => Err(BoardError(format!(
+                    "expected {what} in mm that fits the board, found `{part}`"
+                ))),
             })
             .transpose()
         };
@@ -124,12 +128,31 @@ impl BoardLayout {
                         dictionary.len()
                     )));
                 }
-                Pattern::Charuco { marker_mm, dictionary }
+                let legacy = match parts.next() {
+                    None => false,
+                    Some("legacy") => true,
+                    Some(other) => {
+                        return Err(BoardError(format!(
+                            "expected `legacy` or nothing after the dictionary, found `{other}`"
+                        )));
+                    }
+                };
+                Pattern::Charuco {
+                    marker_mm,
+                    dictionary,
+                    legacy,
+                }
             }
-            other => return Err(BoardError(format!("expected checkerboard, charuco, circles or acircles, found `{other}`"))),
+            other => {
+                return Err(BoardError(format!(
+                    "expected checkerboard, charuco, circles or acircles, found `{other}`"
+                )));
+            }
         };
         if let Some(rest) = parts.next() {
-            return Err(BoardError(format!("expected the end after `{text}`'s known parts, found `{rest}`")));
+            return Err(BoardError(format!(
+                "expected the end after `{text}`'s known parts, found `{rest}`"
+            )));
         }
         Ok(Self {
             pattern,

@@ -58,7 +58,13 @@ pub fn detect(gray: &Image<f32>, layout: &BoardLayout) -> Option<Detection> {
         .iter()
         .map(|(site, feature)| {
             let saddle = &found[*feature];
-            (*site, Rough { pixel: saddle.pixel, edges: saddle.edges })
+            (
+                *site,
+                Rough {
+                    pixel: saddle.pixel,
+                    edges: saddle.edges,
+                },
+            )
         })
         .collect();
     let mut corners = refined(gray, &sites, &starts);
@@ -94,7 +100,10 @@ fn levels(gray: &Image<f32>) -> Vec<(Image<f32>, f64)> {
         let next = (halved(last), scale * 2.0);
         pyramid.push(next);
     }
-    let first = pyramid.iter().rposition(|(image, _)| image.width() >= FIRST_WIDTH).unwrap_or(0);
+    let first = pyramid
+        .iter()
+        .rposition(|(image, _)| image.width() >= FIRST_WIDTH)
+        .unwrap_or(0);
     // First, finer, coarser, and so on outward.
     let mut numbered: Vec<(usize, (Image<f32>, f64))> = pyramid.into_iter().enumerate().collect();
     numbered.sort_by_key(|(level, _)| 2 * level.abs_diff(first) + usize::from(*level > first));
@@ -173,7 +182,11 @@ fn seed(found: &[Saddle], first: usize) -> Option<Seed> {
             .map(|(_, other)| [other.pixel.x - start.pixel.x, other.pixel.y - start.pixel.y])
             .min_by(|a, b| a[0].hypot(a[1]).total_cmp(&b[0].hypot(b[1])))?;
         // Along the edge's own sense, so that bright lies between the two steps.
-        let along = if axis == 1 && along < start.edges[0] { along + PI } else { along };
+        let along = if axis == 1 && along < start.edges[0] {
+            along + PI
+        } else {
+            along
+        };
         let sense = (nearest[0] * along.cos() + nearest[1] * along.sin()).signum();
         steps[axis] = [nearest[0] * sense, nearest[1] * sense];
     }
@@ -207,7 +220,10 @@ fn window(at: Pixel, cell: Cell, places: &BTreeMap<Cell, Pixel>) -> Option<f64> 
 }
 
 fn refined(gray: &Image<f32>, sites: &[Site], starts: &BTreeMap<usize, Rough>) -> BTreeMap<usize, FittedCorner> {
-    let places: BTreeMap<Cell, Pixel> = starts.iter().map(|(site, rough)| (sites[*site].lattice, rough.pixel)).collect();
+    let places: BTreeMap<Cell, Pixel> = starts
+        .iter()
+        .map(|(site, rough)| (sites[*site].lattice, rough.pixel))
+        .collect();
     starts
         .iter()
         .filter_map(|(site, rough)| {
@@ -227,7 +243,10 @@ fn complete(gray: &Image<f32>, sites: &[Site], corners: &mut BTreeMap<usize, Fit
     let by_cell: BTreeMap<Cell, usize> = sites.iter().enumerate().map(|(index, site)| (site.lattice, index)).collect();
     loop {
         let mut added = Vec::new();
-        let places: BTreeMap<Cell, Pixel> = corners.iter().map(|(site, corner)| (sites[*site].lattice, corner.pixel)).collect();
+        let places: BTreeMap<Cell, Pixel> = corners
+            .iter()
+            .map(|(site, corner)| (sites[*site].lattice, corner.pixel))
+            .collect();
         for (index, site) in sites.iter().enumerate() {
             if corners.contains_key(&index) {
                 continue;
@@ -259,7 +278,9 @@ fn complete(gray: &Image<f32>, sites: &[Site], corners: &mut BTreeMap<usize, Fit
                 y: guesses.iter().map(|(at, _)| at[1]).sum::<f64>() / n,
             };
             let neighbour = guesses[0].1;
-            let Some(radius_px) = window(pixel, site.lattice, &places) else { continue };
+            let Some(radius_px) = window(pixel, site.lattice, &places) else {
+                continue;
+            };
             let start = Start {
                 pixel,
                 // The neighbour's bright is our dark.

@@ -1,15 +1,17 @@
 //! Finding a grid of dots: blobs of elliptic shape, grown to a lattice, put on the board.
 //!
-//! A dot's middle is the centre of gravity of how much darker (or brighter) than the paper each pixel is; the paper is a plane fitted to
-//! a ring around the dot, so that vignetting does not pull. Every pixel of an ellipse wider than the dot counts, in or out, with its
-//! noise: a sum without threshold has no bias.
+//! A dot's middle is that of the ellipse through its rim: on rays from the middle, the place of the steepest step from dot to paper,
+//! to a part of a pixel; the first wave of those lengths around the dot shifts the ellipse, the second reshapes it, and rays that met
+//! something else (a reflex, the edge of a neighbour) are left out. What happens inside the dot, a drilled hole's lit bottom for
+//! example, does not matter, nor does the brightness of the paper.
 
-use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};
+use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
 use crate::calibration::board::{BoardLayout, Pattern};
 use crate::calibration::detection::{BoardCorner, Detection};
 use crate::calibration::lattice::{Cell, Lattice, Seed, grown};
 use crate::calibration::placement::{Placed, placed};
+use crate::calibration::saddle::bilinear;
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::image::blur::{BlurScratch, box_blur};
@@ -33,9 +35,15 @@ const MOST_SLIM: f64 = 4.0;
 const MOST_SEEDS: usize = 80;
 /// A piece of fewer dots is no board.
 const FEWEST_DOTS: usize = 10;
-/// Ellipse around a dot that holds all of it, and the ring that shows the paper, in units of the dot's axes.
-const WHOLE_DOT: f64 = 1.4;
-const PAPER: f64 = 1.75;
+/// Rays from a dot's middle to its rim.
+const RAYS: usize = 48;
+/// Where on a ray the rim is looked for, in units of the dot's radius.
+const NEAR: f64 = 0.5;
+const FAR: f64 = 1.5;
+/// Times that rim and ellipse are found from each other.
+const ROUNDS: usize = 4;
+/// A rim may be this rough, in units of the radius.
+const MOST_ROUGHNESS: f64 = 0.2;
 
 #[derive(Clone, Copy, Debug)]
 struct Blob {
@@ -55,9 +63,11 @@ pub fn detect(gray: &Image<f32>, layout: &BoardLayout, diameter_mm: Option<f64>)
         for dark in [true, false] {
             let blobs: Vec<Blob> = blobs(&soft, window, dark)
                 .iter()
-                .filter_map(|blob| centered(gray, blob, dark))
+                .filter_map(|blob| rimmed(&soft, blob, dark))
                 .collect();
-            let Some((placed, lattice)) = largest(&blobs, layout) else { continue };
+            let Some((placed, lattice)) = largest(&blobs, layout) else {
+                continue;
+            };
             if best.as_ref().is_none_or(|(known, ..)| placed.pairs.len() > known.pairs.len()) {
                 best = Some((placed, blobs, lattice));
             }
@@ -92,7 +102,11 @@ pub fn detect(gray: &Image<f32>, layout: &BoardLayout, diameter_mm: Option<f64>)
 fn blobs(soft: &Image<f32>, window: f64, dark: bool) -> Vec<Blob> {
     let (width, height) = soft.size();
     let mut mean = soft.clone();
-    box_blur(&mut mean, ((width as f64 * window) as usize).max(4), &mut BlurScratch::default());
+    box_blur(
+        &mut mean,
+        ((width as f64 * window) as usize).max(4),
+        &mut BlurScratch::default(),
+    );
     let mut mask = Image::filled(width, height, 0_u8);
     for (out, (value, mean)) in mask.pixels_mut().iter_mut().zip(soft.pixels().iter().zip(mean.pixels())) {
         let difference = if dark { mean - value } else { value - mean };
@@ -149,82 +163,115 @@ fn elliptic(rows: &[(u32, u32, u32)], most_area: f64) -> Option<Blob> {
     })
 }
 
-/// The same dot with its centre of gravity, area and their noise; `None` where it does not stand out.
-fn centered(gray: &Image<f32>, blob: &Blob, dark: bool) -> Option<Blob> {
-    let mut blob = *blob;
-    for _ in 0..3 {
-        // At 1 on the ellipse of the dot's moments: axes are twice the roots of the eigenvalues.
-        let inverse = blob.moments.try_inverse()?;
-        let far = |x: f64, y: f64| {
-            let d = Vector2::new(x - blob.middle.x, y - blob.middle.y);
-            (d.dot(&(inverse * d)) / 4.0).sqrt()
-        };
-        let reach_x = 2.0 * PAPER * blob.moments[(0, 0)].sqrt();
-        let reach_y = 2.0 * PAPER * blob.moments[(1, 1)].sqrt();
-        let (left, right) = ((blob.middle.x - reach_x).floor(), (blob.middle.x + reach_x).ceil());
-        let (top, bottom) = ((blob.middle.y - reach_y).floor(), (blob.middle.y + reach_y).ceil());
-        if left < 0.0 || top < 0.0 || right >= gray.width() as f64 || bottom >= gray.height() as f64 {
-            return None;
-        }
-        let (mut normal, mut slope, mut ring, mut ring_square) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0.0);
-        let mut inside = Vec::new();
-        for y in top as usize..=bottom as usize {
-            for x in left as usize..=right as usize {
-                let (u, v) = (x as f64, y as f64);
-                let value = f64::from(gray.at(x, y));
-                let far = far(u, v);
-                if far < WHOLE_DOT {
-                    inside.push((u, v, value, far));
-                } else if far < PAPER {
-                    let row = Vector3::new(1.0, u - blob.middle.x, v - blob.middle.y);
-                    normal += row * row.transpose();
-                    slope += row * value;
-                    ring += 1.0;
-                    ring_square += value * value;
-                }
-            }
-        }
-        let plane = normal.cholesky()?.solve(&slope);
-        let noise = ((ring_square - plane.dot(&slope)).max(0.0) / f64::max(ring - 3.0, 1.0)).sqrt();
-        let sign = if dark { 1.0 } else { -1.0 };
-        let stands_out =
-            |u: f64, v: f64, value: f64| sign * (plane[0] + plane[1] * (u - blob.middle.x) + plane[2] * (v - blob.middle.y) - value);
-        let (mut core, mut core_count) = (0.0, 0.0);
-        let (mut total, mut sum, mut clipped) = (0.0, Vector2::zeros(), 0.0);
-        for (u, v, value, far) in &inside {
-            let amount = stands_out(*u, *v, *value);
-            if *far < 0.6 {
-                core += amount;
-                core_count += 1.0;
-            }
-            total += amount;
-            sum += Vector2::new(*u, *v) * amount;
-        }
-        let contrast: f64 = core / f64::max(core_count, 1.0);
-        if contrast < f64::from(LEAST_DIFFERENCE) || total <= 0.0 {
-            return None;
-        }
-        for (u, v, value, _) in &inside {
-            clipped += (stands_out(*u, *v, *value) / contrast).clamp(0.0, 1.0);
-        }
-        let middle = sum / total;
-        if (middle - Vector2::new(blob.middle.x, blob.middle.y)).norm() > 0.6 * blob.area.sqrt() {
-            return None;
-        }
-        let spread: f64 = inside.iter().map(|(u, _, _, _)| (u - middle.x).powi(2)).sum();
-        blob.sigma_px = noise * spread.sqrt() / total;
-        blob.middle = Pixel {
-            x: middle.x,
-            y: middle.y,
-        };
-        // The ellipse keeps its shape and takes the area that was measured.
-        blob.moments *= clipped / blob.area;
-        blob.area = clipped;
-        if !(blob.area > 6.0 && blob.area.is_finite()) {
+/// The same dot by its rim; `None` where it has none.
+fn rimmed(soft: &Image<f32>, blob: &Blob, dark: bool) -> Option<Blob> {
+    let mut middle = Vector2::new(blob.middle.x, blob.middle.y);
+    // Takes the unit circle to the rim: an ellipse's axes are twice the roots of its moments.
+    let mut shape = blob.moments.cholesky()?.l() * 2.0;
+    let mut sigma_px = f64::NAN;
+    for round in 0..ROUNDS {
+        let rim = rim(soft, middle, &shape, dark);
+        let wave = wave(&rim)?;
+        let size = shape.determinant().abs().sqrt();
+        sigma_px = wave.deviation * size * (2.0 / rim.len() as f64).sqrt();
+        middle += shape * Vector2::new(wave.along[1], wave.along[2]);
+        let (a, b) = (wave.along[3], wave.along[4]);
+        shape = shape * (1.0 + wave.along[0]) * Matrix2::new(1.0 + a, b, b, 1.0 - a);
+        let ratio = shape.determinant() * std::f64::consts::PI / blob.area;
+        let jumped = (middle - Vector2::new(blob.middle.x, blob.middle.y)).norm() > 0.5 * size;
+        if jumped || !(0.4..2.5).contains(&ratio) || (round + 1 == ROUNDS && wave.deviation > MOST_ROUGHNESS) {
             return None;
         }
     }
-    Some(blob)
+    Some(Blob {
+        middle: Pixel {
+            x: middle.x,
+            y: middle.y,
+        },
+        moments: shape * shape.transpose() / 4.0,
+        area: std::f64::consts::PI * shape.determinant().abs(),
+        sigma_px,
+    })
+}
+
+/// Where each ray crosses the rim: its angle, and its length less one, on the unit circle that `shape` takes to the ellipse.
+fn rim(soft: &Image<f32>, middle: Vector2<f64>, shape: &Matrix2<f64>, dark: bool) -> Vec<[f64; 2]> {
+    let sign = if dark { 1.0 } else { -1.0 };
+    let mut rim = Vec::with_capacity(RAYS);
+    for ray in 0..RAYS {
+        let angle = std::f64::consts::TAU * ray as f64 / RAYS as f64;
+        let direction = shape * Vector2::new(angle.cos(), angle.sin());
+        let step = 0.5 / direction.norm();
+        let steps = ((FAR - NEAR) / step).ceil() as usize;
+        let profile: Option<Vec<f64>> = (0..=steps)
+            .map(|k| {
+                let at = middle + direction * (NEAR + step * k as f64);
+                bilinear(soft, at.x, at.y)
+            })
+            .collect();
+        let Some(profile) = profile else { continue };
+        let slopes: Vec<f64> = profile.windows(3).map(|w| sign * (w[2] - w[0])).collect();
+        let Some(top) = (0..slopes.len()).max_by(|a, b| slopes[*a].total_cmp(&slopes[*b])) else {
+            continue;
+        };
+        if top == 0 || top + 1 >= slopes.len() || slopes[top] < f64::from(LEAST_DIFFERENCE) * 0.3 {
+            continue;
+        }
+        let bend = slopes[top - 1] + slopes[top + 1] - 2.0 * slopes[top];
+        let offset = if bend < 0.0 {
+            (slopes[top - 1] - slopes[top + 1]) / (2.0 * bend)
+        } else {
+            0.0
+        };
+        rim.push([angle, NEAR + step * (top as f64 + 1.0 + offset) - 1.0]);
+    }
+    rim
+}
+
+struct Wave {
+    /// Of 1, cos, sin, cos 2, sin 2.
+    along: SVector<f64, 5>,
+    /// What is left, on the unit circle.
+    deviation: f64,
+}
+
+/// The first two waves of the rim around the unit circle, without rays that went astray.
+fn wave(rim: &[[f64; 2]]) -> Option<Wave> {
+    let row = |angle: f64| {
+        let (sin, cos) = angle.sin_cos();
+        let (sin2, cos2) = (2.0 * angle).sin_cos();
+        SVector::<f64, 5>::new(1.0, cos, sin, cos2, sin2)
+    };
+    let mut limit = f64::INFINITY;
+    let mut wave = Wave {
+        along: SVector::zeros(),
+        deviation: f64::INFINITY,
+    };
+    for _ in 0..4 {
+        let kept: Vec<&[f64; 2]> = rim
+            .iter()
+            .filter(|[angle, length]| (row(*angle).dot(&wave.along) - length).abs() <= limit)
+            .collect();
+        if kept.len() < RAYS * 3 / 5 {
+            return None;
+        }
+        let (mut normal, mut slope) = (SMatrix::<f64, 5, 5>::zeros(), SVector::<f64, 5>::zeros());
+        for [angle, length] in &kept {
+            let row = row(*angle);
+            normal += row * row.transpose();
+            slope += row * *length;
+        }
+        wave.along = normal.cholesky()?.solve(&slope);
+        let mut left: Vec<f64> = rim
+            .iter()
+            .map(|[angle, length]| (row(*angle).dot(&wave.along) - length).abs())
+            .collect();
+        left.sort_by(f64::total_cmp);
+        // The median of a normal deviation's size is 0.6745 of it.
+        wave.deviation = left[left.len() / 2] / 0.6745;
+        limit = 2.5 * wave.deviation.max(1e-3);
+    }
+    Some(wave)
 }
 
 fn largest(blobs: &[Blob], layout: &BoardLayout) -> Option<(Placed, Lattice)> {

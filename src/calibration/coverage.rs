@@ -63,7 +63,12 @@ pub fn coverage(calibration: &Calibration) -> Coverage {
     }
     let tilts: Vec<f64> = tilts(calibration).map(|tilt| tilt.norm().min(1.0).asin()).collect();
     let distances: Vec<f64> = middles(calibration).map(|middle| middle.norm()).collect();
-    let range = |values: &[f64]| [values.iter().copied().fold(f64::INFINITY, f64::min), values.iter().copied().fold(0.0, f64::max)];
+    let range = |values: &[f64]| {
+        [
+            values.iter().copied().fold(f64::INFINITY, f64::min),
+            values.iter().copied().fold(0.0, f64::max),
+        ]
+    };
     let k = &camera.intrinsics;
     Coverage {
         share: counts.iter().map(|c| c[0]).sum::<f64>() / counts.iter().map(|c| c[1]).sum::<f64>().max(1.0),
@@ -78,7 +83,11 @@ pub fn coverage(calibration: &Calibration) -> Coverage {
 /// What should be said about the calibration, in plain sentences.
 pub fn warnings(calibration: &Calibration, coverage: &Coverage) -> Vec<String> {
     let mut warnings = Vec::new();
-    let views = calibration.views.iter().filter(|view| view.residuals.iter().any(|r| r.used)).count();
+    let views = calibration
+        .views
+        .iter()
+        .filter(|view| view.residuals.iter().any(|r| r.used))
+        .count();
     if views < FEW_VIEWS {
         warnings.push(format!("only {views} views were used: take at least {FEW_VIEWS}, better 20"));
     }
@@ -90,10 +99,21 @@ pub fn warnings(calibration: &Calibration, coverage: &Coverage) -> Vec<String> {
         ));
     }
     let names = ["left top", "right top", "left bottom", "right bottom"];
-    let (least, most) = coverage.quarters.iter().fold((1.0_f64, 0.0_f64), |(a, b), q| (a.min(*q), b.max(*q)));
+    let (least, most) = coverage
+        .quarters
+        .iter()
+        .fold((1.0_f64, 0.0_f64), |(a, b), q| (a.min(*q), b.max(*q)));
     if least < 0.4 * most {
-        let poor: Vec<&str> = names.into_iter().zip(coverage.quarters).filter(|(_, q)| *q < 0.4 * most).map(|(n, _)| n).collect();
-        warnings.push(format!("the views are one-sided: hardly any corner in the quarter {}", poor.join(" and ")));
+        let poor: Vec<&str> = names
+            .into_iter()
+            .zip(coverage.quarters)
+            .filter(|(_, q)| *q < 0.4 * most)
+            .map(|(n, _)| n)
+            .collect();
+        warnings.push(format!(
+            "the views are one-sided: hardly any corner in the quarter {}",
+            poor.join(" and ")
+        ));
     }
     if coverage.tilt_degrees[1] < LEAST_TILT_RAD.to_degrees() {
         warnings.push(format!(
@@ -114,14 +134,21 @@ pub fn warnings(calibration: &Calibration, coverage: &Coverage) -> Vec<String> {
     let (w, h) = (calibration.camera.width as f64 - 1.0, calibration.camera.height as f64 - 1.0);
     let corner = k.cx.max(w - k.cx).hypot(k.cy.max(h - k.cy));
     if let Some(fold) = lens::fold_px(&calibration.camera, corner) {
-        let covered = if fold < coverage.reach_px { ", even among the corners seen" } else { "" };
+        let covered = if fold < coverage.reach_px {
+            ", even among the corners seen"
+        } else {
+            ""
+        };
         warnings.push(format!(
             "the lens model turns back on itself {fold:.0} px from the picture's middle{covered}: beyond that nothing can be undistorted; \
              see that corners reach the border, or fit fewer terms"
         ));
     }
     if k.cx < 0.0 || k.cy < 0.0 || k.cx > w || k.cy > h {
-        warnings.push(format!("the principal point ({:.0}, {:.0}) lies outside the picture", k.cx, k.cy));
+        warnings.push(format!(
+            "the principal point ({:.0}, {:.0}) lies outside the picture",
+            k.cx, k.cy
+        ));
     }
     if calibration.covariance.is_none() {
         warnings.push("some parameters are not determined by these views at all".into());
@@ -187,7 +214,7 @@ pub fn inside(hull: &[Pixel], at: Pixel) -> bool {
         && hull
             .iter()
             .zip(hull.iter().cycle().skip(1))
-            .all(|(a, b)| (b.x - a.x) * (at.y - a.y) - (b.y - a.y) * (at.x - a.x) >= 0.0)
+            .all(|(a, b)| (b.x - a.x) * (at.y - a.y) - (b.y - a.y) * (at.x - a.x) >= -1e-6)
 }
 
 #[cfg(test)]

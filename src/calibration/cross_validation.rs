@@ -113,7 +113,10 @@ fn compared(a: &CameraModel, b: &CameraModel, distance_mm: f64, hull: &[Pixel]) 
         Some((seen.x - pixel.x).hypot(seen.y - pixel.y))
     };
     let map_px: Vec<Option<f64>> = (0..COLUMNS * rows).map(|i| difference(place(i))).collect();
-    let mut covered: Vec<f64> = (0..COLUMNS * rows).filter(|i| inside(hull, place(*i))).filter_map(|i| map_px[i]).collect();
+    let mut covered: Vec<f64> = (0..COLUMNS * rows)
+        .filter(|i| inside(hull, place(*i)))
+        .filter_map(|i| map_px[i])
+        .collect();
     covered.sort_by(f64::total_cmp);
     Some(Difference {
         columns: COLUMNS,

@@ -1,6 +1,7 @@
 //! A board found in a picture: which of its corners are seen, and where.
 
 use crate::calibration::board::{BoardLayout, Pattern};
+use crate::calibration::charuco::Print;
 use crate::calibration::placement::Naming;
 use crate::calibration::{charuco, checkerboard, circles};
 use crate::camera::intrinsics::Pixel;
@@ -42,7 +43,11 @@ pub fn detect(image: &Image<Rgb8>, layout: &BoardLayout) -> Option<Detection> {
 pub fn detect_in_gray(gray: &Image<f32>, layout: &BoardLayout) -> Option<Detection> {
     match layout.pattern {
         Pattern::Checkerboard => checkerboard::detect(gray, layout),
-        Pattern::Charuco { marker_mm, dictionary } => charuco::detect(gray, layout, marker_mm, dictionary),
+        Pattern::Charuco {
+            marker_mm,
+            dictionary,
+            legacy,
+        } => charuco::detect(gray, &Print::new(layout, marker_mm, dictionary, legacy), layout),
         Pattern::Circles { diameter_mm } | Pattern::AsymmetricCircles { diameter_mm } => {
             circles::detect(gray, layout, diameter_mm)
         }

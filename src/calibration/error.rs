@@ -5,7 +5,8 @@
 pub enum CalibrationError {
     /// Not enough pictures with a board in them.
     #[error(
-        "expected the board in at least {} pictures, found it in {found} of {pictures}; {advice}", LEAST_VIEWS
+        "expected the board in at least {} pictures, found it in {found} of {pictures}; {advice}",
+        LEAST_VIEWS
     )]
     TooFewViews {
         /// Pictures with a board.

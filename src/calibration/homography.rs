@@ -41,7 +41,9 @@ pub fn mapped(map: &Matrix3<f64>, at: [f64; 2]) -> Option<[f64; 2]> {
 
 fn normalizing(points: impl Iterator<Item = [f64; 2]> + Clone) -> Option<Matrix3<f64>> {
     let count = points.clone().count() as f64;
-    let mean = points.clone().fold([0.0; 2], |sum, p| [sum[0] + p[0] / count, sum[1] + p[1] / count]);
+    let mean = points
+        .clone()
+        .fold([0.0; 2], |sum, p| [sum[0] + p[0] / count, sum[1] + p[1] / count]);
     let spread = points.map(|p| (p[0] - mean[0]).hypot(p[1] - mean[1])).sum::<f64>() / count;
     let scale = std::f64::consts::SQRT_2 / spread;
     scale

@@ -54,8 +54,14 @@ pub fn grown(features: &[Pixel], seed: Seed, fits: &dyn Fn(usize, Cell) -> bool)
     loop {
         let mut wanted: Vec<(f64, Cell, usize, Member)> = Vec::new();
         for cell in empty_neighbours(&members) {
-            let Some(prediction) = predicted(&members, cell) else { continue };
-            let shorter = prediction.steps.iter().map(|step| step[0].hypot(step[1])).fold(f64::INFINITY, f64::min);
+            let Some(prediction) = predicted(&members, cell) else {
+                continue;
+            };
+            let shorter = prediction
+                .steps
+                .iter()
+                .map(|step| step[0].hypot(step[1]))
+                .fold(f64::INFINITY, f64::min);
             let reach = MOST_DEVIATION * shorter;
             if !(reach.is_finite() && reach > 0.5) {
                 continue;
@@ -124,7 +130,9 @@ fn predicted(members: &BTreeMap<Cell, Member>, cell: Cell) -> Option<Member> {
     let mut voters = 0.0;
     for axis in 0..2 {
         for by in [-1, 1] {
-            let Some(near) = members.get(&moved(cell, axis, by)) else { continue };
+            let Some(near) = members.get(&moved(cell, axis, by)) else {
+                continue;
+            };
             let mut say = |x: f64, y: f64, w: f64| {
                 sum[0] += w * x;
                 sum[1] += w * y;

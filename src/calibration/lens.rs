@@ -42,7 +42,10 @@ impl LensModel {
     pub fn camera(self, width: usize, height: usize, intrinsics: Intrinsics) -> CameraModel {
         let distortion = match self {
             Self::Equidistant => Distortion::KannalaBrandt { k: [0.0; 4] },
-            Self::PlumbBob | Self::RationalPolynomial => Distortion::BrownConrady { k: [0.0; 6], p: [0.0; 2] },
+            Self::PlumbBob | Self::RationalPolynomial => Distortion::BrownConrady {
+                k: [0.0; 6],
+                p: [0.0; 2],
+            },
         };
         CameraModel {
             width,

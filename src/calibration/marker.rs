@@ -32,7 +32,8 @@ impl FromStr for Dictionary {
     fn from_str(text: &str) -> Result<Self, String> {
         let lower = text.to_ascii_lowercase();
         let name = lower.strip_prefix("dict_").unwrap_or(&lower);
-        let known = || format!("expected a dictionary 4x4, 5x5, 6x6 or 7x7 of 50, 100, 250 or 1000 such as 4x4_250, found `{text}`");
+        let known =
+            || format!("expected a dictionary 4x4, 5x5, 6x6 or 7x7 of 50, 100, 250 or 1000 such as 4x4_250, found `{text}`");
         let (cells, len) = name.split_once('_').ok_or_else(known)?;
         let cells = match cells {
             "4x4" => 4,

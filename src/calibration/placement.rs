@@ -75,7 +75,10 @@ pub fn placed(lattice: &Lattice, features: &[Pixel], layout: &BoardLayout) -> Op
             let basis = product(turn, shear);
             let known = candidates.len();
             collect(lattice, &sites, &basis, colored.then_some(quarters), &mut candidates);
-            candidates.iter_mut().skip(known).for_each(|candidate| candidate.sheared = place > 0);
+            candidates
+                .iter_mut()
+                .skip(known)
+                .for_each(|candidate| candidate.sheared = place > 0);
         }
     }
     let most = candidates.iter().map(|candidate| candidate.on_board).max()?;
@@ -154,7 +157,11 @@ fn collect(lattice: &Lattice, sites: &[Site], basis: &Basis, quarters: Option<us
         }
     }
     let Some(most) = counts.values().copied().max() else { return };
-    let distinct: BTreeSet<Cell> = counts.iter().filter(|(_, met)| **met == most).map(|(shift, _)| *shift).collect();
+    let distinct: BTreeSet<Cell> = counts
+        .iter()
+        .filter(|(_, met)| **met == most)
+        .map(|(shift, _)| *shift)
+        .collect();
     for shift in distinct {
         // Bright lies between the steps of even cells; on the board, of odd ones. A quarter turn swaps the colors.
         let colors_agree = quarters.is_none_or(|quarters| (shift[0] + shift[1] + quarters as i32).rem_euclid(2) == 1);
@@ -215,7 +222,10 @@ mod tests {
                     };
                     let placed = placed(&lattice, &features, &layout).unwrap();
                     assert_eq!(placed.naming, Naming::Unique, "{text}");
-                    assert!(placed.pairs.iter().all(|(site, feature)| site == feature), "{text} {quarters} {degrees}");
+                    assert!(
+                        placed.pairs.iter().all(|(site, feature)| site == feature),
+                        "{text} {quarters} {degrees}"
+                    );
                 }
             }
         }

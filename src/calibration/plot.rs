@@ -53,7 +53,10 @@ pub fn drawn(calibration: &Calibration, difference: Option<&Difference>) -> Imag
             continue;
         }
         let length = residual.error_px[0].hypot(residual.error_px[1]);
-        let to = [from[0] + magnification * residual.error_px[0], from[1] + magnification * residual.error_px[1]];
+        let to = [
+            from[0] + magnification * residual.error_px[0],
+            from[1] + magnification * residual.error_px[1],
+        ];
         let color = heat(length / (1.5 * long));
         line(&mut canvas, from, to, color);
         fill(&mut canvas, from[0] - 1.0, from[1] - 1.0, 2, 2, color);
@@ -73,11 +76,25 @@ pub fn drawn(calibration: &Calibration, difference: Option<&Difference>) -> Imag
             let (u, v) = ((place % columns) as f64, (place / columns) as f64);
             let (w, h) = (PANEL_WIDTH as f64 / columns as f64, height as f64 / rows as f64);
             let color = value.map_or([0, 0, 0], |value| heat(value / most));
-            fill(&mut canvas, right + u * w, top + v * h, w.ceil() as usize, h.ceil() as usize, color);
+            fill(
+                &mut canvas,
+                right + u * w,
+                top + v * h,
+                w.ceil() as usize,
+                h.ceil() as usize,
+                color,
+            );
         }
         for step in 0..120 {
             let color = heat(f64::from(step) / 119.0);
-            fill(&mut canvas, right + 520.0 + f64::from(step), MARGIN as f64 + 2.0, 1, 16, color);
+            fill(
+                &mut canvas,
+                right + 520.0 + f64::from(step),
+                MARGIN as f64 + 2.0,
+                1,
+                16,
+                color,
+            );
         }
         text(&mut canvas, right as usize + 490, MARGIN, "0");
         text(&mut canvas, right as usize + 650, MARGIN, &format!("{most} PX"));
@@ -86,7 +103,12 @@ pub fn drawn(calibration: &Calibration, difference: Option<&Difference>) -> Imag
     } else {
         text(&mut canvas, right as usize, MARGIN, "TOO FEW VIEWS TO COMPARE HALVES");
     }
-    let around = hull(residuals(calibration).filter(|residual| residual.used).map(|residual| residual.corner.pixel).collect());
+    let around = hull(
+        residuals(calibration)
+            .filter(|residual| residual.used)
+            .map(|residual| residual.corner.pixel)
+            .collect(),
+    );
     for (a, b) in around.iter().zip(around.iter().cycle().skip(1)) {
         for panel in [left, right] {
             line(&mut canvas, at(panel, *a), at(panel, *b), WHITE);
@@ -203,7 +225,9 @@ const CELL: usize = 4;
 
 fn text(canvas: &mut Image<Rgb8>, x: usize, y: usize, words: &str) {
     for (place, letter) in words.chars().enumerate() {
-        let Some((_, rows)) = GLYPHS.iter().find(|(known, _)| *known == letter) else { continue };
+        let Some((_, rows)) = GLYPHS.iter().find(|(known, _)| *known == letter) else {
+            continue;
+        };
         for (v, row) in rows.iter().enumerate() {
             for u in 0..3 {
                 if row >> (2 - u) & 1 == 1 {

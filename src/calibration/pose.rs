@@ -45,7 +45,9 @@ pub fn board_pose(camera: &CameraModel, corners: &[BoardCorner]) -> Option<Board
     let mut best: Option<BoardPose> = None;
     let mut other: Option<f64> = None;
     for start in [first, tilted_other_way(&first, corners)] {
-        let Some(pose) = refined(camera, corners, start) else { continue };
+        let Some(pose) = refined(camera, corners, start) else {
+            continue;
+        };
         match &best {
             Some(known) if known.rms_px <= pose.rms_px => other = Some(pose.rms_px),
             _ => {
@@ -151,7 +153,10 @@ fn refined(camera: &CameraModel, corners: &[BoardCorner], start: Transform<Camer
     let errors = errors_px(camera, corners, &pose)?;
     let limit = OUTLIER_DEVIATIONS * deviation(&errors).max(LEAST_DEVIATION_PX);
     let outliers: Vec<usize> = (0..errors.len()).filter(|i| errors[*i] > limit).collect();
-    let kept: Vec<BoardCorner> = (0..corners.len()).filter(|i| errors[*i] <= limit).map(|i| corners[i]).collect();
+    let kept: Vec<BoardCorner> = (0..corners.len())
+        .filter(|i| errors[*i] <= limit)
+        .map(|i| corners[i])
+        .collect();
     if kept.len() < 4 {
         return None;
     }
@@ -225,8 +230,16 @@ mod tests {
             let board = Point::new(sites[site].board_mm[0], sites[site].board_mm[1], 0.0);
             let at = camera().project(*pose * board).unwrap();
             let mut noise = || noise_px * random.sample::<f64, _>(StandardNormal);
-            let pixel = Pixel { x: at.x + noise(), y: at.y + noise() };
-            BoardCorner { site, board, pixel, sigma_px: noise_px }
+            let pixel = Pixel {
+                x: at.x + noise(),
+                y: at.y + noise(),
+            };
+            BoardCorner {
+                site,
+                board,
+                pixel,
+                sigma_px: noise_px,
+            }
         };
         (0..sites.len()).map(corner).collect()
     }
@@ -243,7 +256,11 @@ mod tests {
             let mut corners = seen(&truth, 0.1, &mut random);
             corners[7].pixel.x += 9.0;
             let found = board_pose(&camera(), &corners).unwrap();
-            assert!(found.outliers.contains(&7) && found.outliers.len() <= 2, "{:?}", found.outliers);
+            assert!(
+                found.outliers.contains(&7) && found.outliers.len() <= 2,
+                "{:?}",
+                found.outliers
+            );
             assert!((0.09..0.18).contains(&found.rms_px), "{}", found.rms_px);
             // truth = found · exp(d).
             let d = found.camera_from_board.inverse() * truth;

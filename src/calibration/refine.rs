@@ -27,8 +27,8 @@ use crate::solver::robust_loss::RobustLoss;
 const OUTLIER_DEVIATIONS: f64 = 6.0;
 /// Huber's width in deviations: 95 % efficient on normal noise (Huber 1964).
 const HUBER_DEVIATIONS: f64 = 1.345;
-/// Below this a deviation is rounding, px.
-const LEAST_DEVIATION_PX: f64 = 0.01;
+/// Deviations below this are as good as corners get: none is left out for being the worst of the best, px.
+const LEAST_DEVIATION_PX: f64 = 0.04;
 /// Views and corners per view that a start is judged by.
 const TRIAL_VIEWS: usize = 16;
 const TRIAL_CORNERS: usize = 40;
@@ -184,7 +184,9 @@ impl Problem for AllViews<'_> {
 
 /// The camera of `views`, pictures of `size` (columns, rows).
 pub fn calibrate(views: &[View], size: (usize, usize), model: LensModel) -> Result<Calibration, CalibrationError> {
-    let usable: Vec<usize> = (0..views.len()).filter(|i| views[*i].corners.len() >= FEWEST_CORNERS).collect();
+    let usable: Vec<usize> = (0..views.len())
+        .filter(|i| views[*i].corners.len() >= FEWEST_CORNERS)
+        .collect();
     let mut corners: Vec<Vec<BoardCorner>> = usable.iter().map(|i| views[*i].corners.clone()).collect();
     if usable.len() < LEAST_VIEWS {
         return Err(CalibrationError::TooFewViews {
@@ -203,7 +205,9 @@ pub fn calibrate(views: &[View], size: (usize, usize), model: LensModel) -> Resu
         state = solution.state.clone();
         if has_dots {
             for (number, view) in usable.iter().enumerate() {
-                let Some(radius_mm) = views[*view].dot_radius_mm else { continue };
+                let Some(radius_mm) = views[*view].dot_radius_mm else {
+                    continue;
+                };
                 let originals = &views[*view].corners;
                 for (corner, original) in corners[number].iter_mut().zip(originals) {
                     if let Some(bias) = dot_bias_px(&state.camera, &state.poses[number], corner.board, radius_mm) {
@@ -232,7 +236,9 @@ fn result(
     let used: usize = kept.iter().flatten().filter(|kept| **kept).count();
     let scaled = solution.scaled_covariance(2 * used);
     let lens_count = model.names().len();
-    let covariance = scaled.as_ref().map(|full| full.view((0, 0), (lens_count, lens_count)).into_owned());
+    let covariance = scaled
+        .as_ref()
+        .map(|full| full.view((0, 0), (lens_count, lens_count)).into_owned());
     let free = 2.0 * used as f64 - lens_count as f64 - 6.0 * usable.len() as f64;
     let mut results: Vec<ViewResult> = views
         .iter()
@@ -304,7 +310,12 @@ fn robustly(
                 .iter()
                 .map(|corner| error_px(&state, number, corner).is_some_and(|error| error <= limit))
                 .collect();
-            let mut remaining: Vec<BoardCorner> = view.iter().zip(&kept[number]).filter(|(_, kept)| **kept).map(|(c, _)| *c).collect();
+            let mut remaining: Vec<BoardCorner> = view
+                .iter()
+                .zip(&kept[number])
+                .filter(|(_, kept)| **kept)
+                .map(|(c, _)| *c)
+                .collect();
             if remaining.len() < FEWEST_CORNERS.max(view.len() / 3) {
                 kept[number].fill(false);
                 remaining.clear();
@@ -363,7 +374,12 @@ fn best_start(corners: &[Vec<BoardCorner>], size: (usize, usize), model: LensMod
         .filter_map(|view| {
             let pairs: Vec<_> = view
                 .iter()
-                .map(|corner| ([corner.board.coords.x, corner.board.coords.y], [corner.pixel.x, corner.pixel.y]))
+                .map(|corner| {
+                    (
+                        [corner.board.coords.x, corner.board.coords.y],
+                        [corner.pixel.x, corner.pixel.y],
+                    )
+                })
                 .collect();
             homography::from_pairs(&pairs)
         })

@@ -12,6 +12,8 @@ use crate::calibration::refine::{Calibration, ViewResult};
 
 /// A view whose RMS is this many times the median view's stands out.
 const OUTLIER_VIEW: f64 = 2.5;
+/// A view better than this does not, px.
+const GOOD_VIEW_PX: f64 = 0.25;
 
 /// One number of the camera.
 #[derive(Clone, Debug, Serialize)]
@@ -148,13 +150,22 @@ impl Report {
         let outlier_corners: Vec<OutlierCorner> = (calibration.views.iter().zip(&circumstances.names))
             .flat_map(|(view, name)| left_out(view, name))
             .collect();
-        let odd: Vec<&str> = views.iter().filter(|view| view.outlier).map(|view| view.name.as_str()).collect();
+        let odd: Vec<&str> = views
+            .iter()
+            .filter(|view| view.outlier)
+            .map(|view| view.name.as_str())
+            .collect();
         if !odd.is_empty() {
             warnings.push(format!("look at {}: much worse than the other views", odd.join(", ")));
         }
-        let (corners, corners_used) = views.iter().fold((0, 0), |(all, used), view| (all + view.corners, used + view.used));
+        let (corners, corners_used) = views
+            .iter()
+            .fold((0, 0), |(all, used), view| (all + view.corners, used + view.used));
         if corners_used * 20 < corners * 19 {
-            warnings.push(format!("{} of {corners} corners were left out as too far off", corners - corners_used));
+            warnings.push(format!(
+                "{} of {corners} corners were left out as too far off",
+                corners - corners_used
+            ));
         }
         if let Some(difference) = difference
             && difference.median_px > 3.0 * calibration.rms_px.max(0.1)
@@ -214,7 +225,11 @@ impl Report {
             self.corners_used,
             self.corners
         );
-        let _ = writeln!(text, "  RMS           {:.3} px (over residual vectors; {:.3} px per axis)", self.rms_px, self.sigma_px);
+        let _ = writeln!(
+            text,
+            "  RMS           {:.3} px (over residual vectors; {:.3} px per axis)",
+            self.rms_px, self.sigma_px
+        );
         match &self.cross_validation {
             Some(cross) => {
                 let _ = writeln!(
@@ -238,10 +253,18 @@ impl Report {
         let _ = writeln!(text, "\n  {:<6}{:>14}{:>14}", "", "value", "sigma");
         for parameter in &self.parameters {
             let digits = if parameter.name.starts_with(['f', 'c']) { 3 } else { 6 };
-            let sigma = parameter.sigma.map_or("undetermined".into(), |sigma| format!("{sigma:.digits$}"));
+            let sigma = parameter
+                .sigma
+                .map_or("undetermined".into(), |sigma| format!("{sigma:.digits$}"));
             let _ = writeln!(text, "  {:<6}{:>14.digits$}{sigma:>14}", parameter.name, parameter.value);
         }
-        let widest = self.views.iter().map(|view| view.name.chars().count()).max().unwrap_or(0).max(4);
+        let widest = self
+            .views
+            .iter()
+            .map(|view| view.name.chars().count())
+            .max()
+            .unwrap_or(0)
+            .max(4);
         let _ = writeln!(text, "\n  {:<widest$}  corners   used    RMS px  worst px", "view");
         for view in &self.views {
             let number = |value: Option<f64>| value.map_or("-".into(), |value| format!("{value:.3}"));
@@ -254,7 +277,11 @@ impl Report {
                 number(view.rms_px),
                 number(view.worst_px),
                 if view.outlier { "  outlier" } else { "" },
-                if view.naming == Naming::Shifted { "  part of a board" } else { "" },
+                if view.naming == Naming::Shifted {
+                    "  part of a board"
+                } else {
+                    ""
+                },
             );
         }
         for corner in self.outlier_corners.iter().take(8) {
@@ -303,15 +330,18 @@ fn mark_outliers(views: &mut [ViewReport]) {
     all.sort_by(f64::total_cmp);
     let median = all.get(all.len() / 2).copied().unwrap_or(0.0);
     for view in views {
-        view.outlier = view.rms_px.is_none_or(|rms| rms > OUTLIER_VIEW * median);
+        view.outlier = view.rms_px.is_none_or(|rms| rms > (OUTLIER_VIEW * median).max(GOOD_VIEW_PX));
     }
 }
 
 fn left_out<'a>(view: &'a ViewResult, name: &'a str) -> impl Iterator<Item = OutlierCorner> + 'a {
-    view.residuals.iter().filter(|residual| !residual.used).map(move |residual| OutlierCorner {
-        view: name.to_owned(),
-        board_mm: [residual.corner.board.coords.x, residual.corner.board.coords.y],
-        pixel: [residual.corner.pixel.x, residual.corner.pixel.y],
-        error_px: residual.error_px[0].hypot(residual.error_px[1]),
-    })
+    view.residuals
+        .iter()
+        .filter(|residual| !residual.used)
+        .map(move |residual| OutlierCorner {
+            view: name.to_owned(),
+            board_mm: [residual.corner.board.coords.x, residual.corner.board.coords.y],
+            pixel: [residual.corner.pixel.x, residual.corner.pixel.y],
+            error_px: residual.error_px[0].hypot(residual.error_px[1]),
+        })
 }

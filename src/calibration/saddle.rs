@@ -97,14 +97,20 @@ fn local_variance(image: &Image<f32>, radius: usize) -> Image<f32> {
 }
 
 fn is_peak(image: &Image<f32>, x: usize, y: usize, value: f32) -> bool {
-    (y - 2..=y + 2).all(|v| (x - 2..=x + 2).all(|u| (u, v) == (x, y) || image.at(u, v) < value || (image.at(u, v) == value && (v, u) > (y, x))))
+    (y - 2..=y + 2).all(|v| {
+        (x - 2..=x + 2).all(|u| (u, v) == (x, y) || image.at(u, v) < value || (image.at(u, v) == value && (v, u) > (y, x)))
+    })
 }
 
 /// The top of the parabola through a peak's neighbours.
 fn peak(image: &Image<f32>, x: usize, y: usize) -> Option<Pixel> {
     let top = |a: f32, b: f32, c: f32| {
         let bend = a + c - 2.0 * b;
-        if bend < 0.0 { ((a - c) / (2.0 * bend)).clamp(-0.5, 0.5) } else { 0.0 }
+        if bend < 0.0 {
+            ((a - c) / (2.0 * bend)).clamp(-0.5, 0.5)
+        } else {
+            0.0
+        }
     };
     let b = image.at(x, y);
     Some(Pixel {
@@ -122,9 +128,7 @@ pub(crate) fn bilinear(image: &Image<f32>, x: f64, y: f64) -> Option<f64> {
     let (u, v) = (x as usize, y as usize);
     let (fx, fy) = (x - u as f64, y - v as f64);
     let at = |u: usize, v: usize| f64::from(image.at(u, v));
-    Some(
-        (at(u, v) * (1.0 - fx) + at(u + 1, v) * fx) * (1.0 - fy) + (at(u, v + 1) * (1.0 - fx) + at(u + 1, v + 1) * fx) * fy,
-    )
+    Some((at(u, v) * (1.0 - fx) + at(u + 1, v) * fx) * (1.0 - fy) + (at(u, v + 1) * (1.0 - fx) + at(u + 1, v + 1) * fx) * fy)
 }
 
 /// The saddle at `center` if the ring around it is that of a corner.
@@ -192,8 +196,14 @@ mod tests {
         let found = saddles(&image);
         assert_eq!(found.len(), 1, "{found:?}");
         let saddle = found[0];
-        assert!((saddle.pixel.x - 19.6).abs() < 0.5 && (saddle.pixel.y - 20.3).abs() < 0.5, "{saddle:?}");
-        assert!((saddle.edges[0] - first).abs() < 0.1 && (saddle.edges[1] - second).abs() < 0.1, "{saddle:?}");
+        assert!(
+            (saddle.pixel.x - 19.6).abs() < 0.5 && (saddle.pixel.y - 20.3).abs() < 0.5,
+            "{saddle:?}"
+        );
+        assert!(
+            (saddle.edges[0] - first).abs() < 0.1 && (saddle.edges[1] - second).abs() < 0.1,
+            "{saddle:?}"
+        );
     }
 
     #[test]

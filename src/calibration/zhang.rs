@@ -107,7 +107,12 @@ mod tests {
             })
             .collect();
         let found = intrinsics(&homographies).unwrap();
-        for (a, b) in [(found.fx, truth.fx), (found.fy, truth.fy), (found.cx, truth.cx), (found.cy, truth.cy)] {
+        for (a, b) in [
+            (found.fx, truth.fx),
+            (found.fy, truth.fy),
+            (found.cx, truth.cx),
+            (found.cy, truth.cy),
+        ] {
             assert!((a - b).abs() < 1e-5, "{found:?}");
         }
         let f = focal_length(&homographies, [470.0, 280.0]).unwrap();

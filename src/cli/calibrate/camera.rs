@@ -24,13 +24,13 @@ use crate::media::image_files;
 #[command(after_help = "Boards (KIND:COLUMNSxROWS):
   checkerboard:9x6            inner corners (where four squares meet), as in OpenCV
   charuco:19x26:4:4x4_250     squares, side of a marker in mm, dictionary (4x4, 5x5, 6x6, 7x7 of 50, 100, 250, 1000; 4x4_250 if left out);
-                              both ways of placing the first marker are known
+                              add :legacy if the rows are even in number and the first square bears a marker (OpenCV before 4.6)
   circles:7x5[:2.5]           dots; diameter in mm (measured if left out); --square-mm is the distance of two dots
   acircles:4x11[:2.5]         11 rows of 4 dots, every other row shifted; --square-mm is half the distance of two dots in a row
 
 Examples:
   endofield calibrate camera pictures/*.png --board checkerboard:9x6 --square-mm 4 -o camera.yaml
-  endofield calibrate camera survey/ --board charuco:19x26:4:4x4_250 --square-mm 5 -o camera.yaml
+  endofield calibrate camera survey/ --board charuco:12x9:3:5x5_100 --square-mm 4 -o camera.yaml
   endofield calibrate camera scope.mp4 --board acircles:3x11 --square-mm 1 --model equidistant -o camera.yaml
 
 Beside camera.yaml are written camera_report.json (all figures, with covariance) and camera_report.png (residual vectors, and where two
@@ -89,7 +89,9 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     for path in [&args.output, &report_path, &plot_path].into_iter().chain(&args.corners_out) {
         context.refuse_overwriting(path)?;
     }
-    let seen = look_at_all(&args.images, args.frames as usize, &context.console, &|image| detect(image, &layout))?;
+    let seen = look_at_all(&args.images, args.frames as usize, &context.console, &|image| {
+        detect(image, &layout)
+    })?;
     let size = same_size(&seen)?;
     let (with_board, without_board): (Vec<_>, Vec<_>) = seen.iter().partition(|seen| seen.found.is_some());
     if with_board.len() < LEAST_VIEWS {
@@ -125,7 +127,10 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     };
     let report = Report::new(&calibration, difference.as_ref(), &circumstances);
     if let Some(path) = &args.corners_out {
-        write_json(path, &corners(&calibration, &circumstances.names, &args.board, args.square_mm))?;
+        write_json(
+            path,
+            &corners(&calibration, &circumstances.names, &args.board, args.square_mm),
+        )?;
     }
     file::write(&args.output, &calibration.camera, "endofield")?;
     write_json(&report_path, &serde_json::to_value(&report)?)?;
@@ -142,7 +147,9 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
 
 /// `camera.yaml` → `camera_report.json`.
 fn beside(output: &Path, ending: &str) -> PathBuf {
-    let stem = output.file_stem().map_or_else(|| "camera".into(), |stem| stem.to_string_lossy());
+    let stem = output
+        .file_stem()
+        .map_or_else(|| "camera".into(), |stem| stem.to_string_lossy());
     output.with_file_name(format!("{stem}{ending}"))
 }
 

@@ -48,7 +48,10 @@ pub fn look_at_all<T: Send>(
     for input in inputs {
         sources.extend(sources_of(input, frames)?);
     }
-    anyhow::ensure!(!sources.is_empty(), "expected pictures, found none; name files, folders or recordings");
+    anyhow::ensure!(
+        !sources.is_empty(),
+        "expected pictures, found none; name files, folders or recordings"
+    );
     let total: usize = sources
         .iter()
         .map(|source| match source {
@@ -69,25 +72,28 @@ fn look_at_sources<T: Send>(
     look: &(dyn Fn(&Image<Rgb8>) -> T + Sync),
 ) -> anyhow::Result<Vec<Seen<T>>> {
     let results: Mutex<Vec<(usize, Vec<Seen<T>>)>> = Mutex::new(Vec::new());
-    sources.par_iter().enumerate().try_for_each(|(place, source)| -> anyhow::Result<()> {
-        anyhow::ensure!(!progress.stopping(), "stopped before all pictures were looked at");
-        let seen = match source {
-            Source::File(path) => {
-                let image = image_files::read(path)?;
-                let seen = Seen {
-                    name: name_of(path),
-                    size: image.size(),
-                    frame: image_files::last_number(&name_of(path)).unwrap_or(place as u64),
-                    found: look(&image),
-                };
-                progress.advance(1);
-                vec![seen]
-            }
-            Source::Video(path) => look_at_video(path, frames, progress, look)?,
-        };
-        results.lock().unwrap_or_else(PoisonError::into_inner).push((place, seen));
-        Ok(())
-    })?;
+    sources
+        .par_iter()
+        .enumerate()
+        .try_for_each(|(place, source)| -> anyhow::Result<()> {
+            anyhow::ensure!(!progress.stopping(), "stopped before all pictures were looked at");
+            let seen = match source {
+                Source::File(path) => {
+                    let image = image_files::read(path)?;
+                    let seen = Seen {
+                        name: name_of(path),
+                        size: image.size(),
+                        frame: image_files::last_number(&name_of(path)).unwrap_or(place as u64),
+                        found: look(&image),
+                    };
+                    progress.advance(1);
+                    vec![seen]
+                }
+                Source::Video(path) => look_at_video(path, frames, progress, look)?,
+            };
+            results.lock().unwrap_or_else(PoisonError::into_inner).push((place, seen));
+            Ok(())
+        })?;
     let mut results = results.into_inner().unwrap_or_else(PoisonError::into_inner);
     results.sort_by_key(|(place, _)| *place);
     Ok(results.into_iter().flat_map(|(_, seen)| seen).collect())
@@ -102,7 +108,10 @@ fn look_at_video<T: Send>(
     let mut reader = VideoReader::open(&Input::from_argument(path))?;
     let pool = Pool::new(BATCH + 1);
     // A container that does not say how long it is: a frame of each half second.
-    let every = reader.info().frame_count.map_or(12, |count| count.div_ceil(frames.max(1) as u64).max(1));
+    let every = reader
+        .info()
+        .frame_count
+        .map_or(12, |count| count.div_ceil(frames.max(1) as u64).max(1));
     let mut seen = Vec::new();
     let mut ended = false;
     while !ended {
@@ -131,8 +140,16 @@ fn look_at_video<T: Send>(
 
 fn sources_of(input: &Path, frames: usize) -> anyhow::Result<Vec<Source>> {
     if !input.is_dir() {
-        anyhow::ensure!(input.exists(), "{}: expected a picture, folder or recording, found nothing", input.display());
-        let source = if image_files::is_picture(input) { Source::File } else { Source::Video };
+        anyhow::ensure!(
+            input.exists(),
+            "{}: expected a picture, folder or recording, found nothing",
+            input.display()
+        );
+        let source = if image_files::is_picture(input) {
+            Source::File
+        } else {
+            Source::Video
+        };
         return Ok(vec![source(input.to_owned())]);
     }
     let pictures = pictures_in(input)?;
@@ -153,11 +170,16 @@ fn sources_of(input: &Path, frames: usize) -> anyhow::Result<Vec<Source>> {
 /// Pictures that lie in a folder itself, by name.
 fn pictures_in(folder: &Path) -> anyhow::Result<Vec<PathBuf>> {
     let entries = std::fs::read_dir(folder).with_context(|| format!("{}: cannot be listed", folder.display()))?;
-    let mut pictures: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(|path| image_files::is_picture(path)).collect();
+    let mut pictures: Vec<PathBuf> = entries
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|path| image_files::is_picture(path))
+        .collect();
     pictures.sort();
     Ok(pictures)
 }
 
 fn name_of(path: &Path) -> String {
-    path.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
+    path.file_name()
+        .map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
 }
