@@ -1,5 +1,6 @@
 //! The commands; the only place that prints.
 
+pub mod arm;
 pub mod console;
 pub mod context;
 pub mod demo;
@@ -50,6 +51,7 @@ enum Command {
     Process(process::Args),
     LightField(light_field::Args),
     Simulate(simulate::Args),
+    Arm(arm::Args),
 }
 
 /// Run the command line; its outcome as the process's exit code.
@@ -116,6 +118,7 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
             light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete)
         }
         Command::Simulate(args) => simulate::run(args, context),
+        Command::Arm(args) => arm::run(&args, context),
     }
 }
 
