@@ -257,16 +257,18 @@ impl LiveLine<'_> {
         let now = MonotonicClock.now();
         if self.told.is_none_or(|told| now - told >= every) {
             self.told = Some(now);
-            self.last(text, json);
+            self.console.say(&if self.console.look == Look::Json {
+                json().to_string()
+            } else {
+                text()
+            });
         }
     }
 
-    /// The same, now; on a terminal the line goes away.
-    pub fn last(&mut self, text: impl FnOnce() -> String, json: impl FnOnce() -> serde_json::Value) {
-        match self.console.look {
-            Look::Json => self.console.say(&json().to_string()),
-            Look::Lines => self.console.say(&text()),
-            Look::Bar | Look::Nothing => {}
+    /// The last state, for machines; people are told otherwise.
+    pub fn last(&mut self, json: impl FnOnce() -> serde_json::Value) {
+        if self.console.look == Look::Json {
+            self.console.say(&json().to_string());
         }
     }
 }

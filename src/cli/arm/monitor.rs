@@ -47,11 +47,13 @@ pub struct Args {
     /// The arm's table of joints [default: arm.kinematics].
     #[arg(long, value_name = "FILE")]
     arm: Option<PathBuf>,
+    /// Whose time the poses carry [default: the device's own for files and standard input, else arm.clock].
+    #[arg(long, value_enum)]
+    clock: Option<ClockName>,
     /// End after so many seconds.
     #[arg(long, value_name = "S")]
     duration: Option<f64>,
-    /// Write every reading: `….csv` as joint values, any other name as poses (TUM layout), stamps on the host's monotonic clock
-    /// (a file's own for a file).
+    /// Write every reading: `….csv` as joint values, any other name as poses (TUM layout).
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
 }
@@ -65,6 +67,14 @@ enum ProtocolName {
     TextPoses,
     /// Joint values a line.
     TextJoints,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum ClockName {
+    /// The host's monotonic clock.
+    Host,
+    /// The device's stamps as they are.
+    Device,
 }
 
 /// Run it.
@@ -89,7 +99,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let mut status = feed.status();
     status.statistics = feed.stop();
     take(&samples, Duration::ZERO, &mut watched, recorder.as_mut())?;
-    live.last(|| line(&status), || json_of("end", &status));
+    live.last(|| json_of("end", &status));
     drop(live);
     if let Some(recorder) = recorder {
         recorder.finish()?;
@@ -131,10 +141,13 @@ fn chosen(args: &Args, context: &Context) -> anyhow::Result<(LineSource, Setting
     if let Some(arm) = &args.arm {
         settings.kinematics = arm.to_string_lossy().into_owned();
     }
-    if matches!(source, LineSource::File(_)) {
-        // A file's own stamps; when its bytes are read says nothing.
-        settings.clock = PoseClock::Device;
-    }
+    settings.clock = match (args.clock, &source) {
+        (Some(ClockName::Host), _) => PoseClock::Host,
+        (Some(ClockName::Device), _) => PoseClock::Device,
+        (None, LineSource::Port(_)) => settings.clock,
+        // When these bytes are read need not say when they were true.
+        (None, LineSource::Input | LineSource::File(_)) => PoseClock::Device,
+    };
     settings.check().map_err(UsageError)?;
     Ok((source, settings))
 }
@@ -259,13 +272,14 @@ impl Recorder {
 
 fn line(status: &FeedStatus) -> String {
     let link = match &status.link {
-        LinkState::Absent(reason) => format!("absent ({reason})"),
+        // What to do about it has been told.
+        LinkState::Absent(reason) => format!("absent ({})", reason.split(';').next().unwrap_or_default()),
         link => link.word().to_owned(),
     };
     let counts = &status.statistics;
     let refused = refused(counts);
     let mut text = format!(
-        "{link} · {:.1} Hz · late {:.1}/{:.1} ms · lost {} · bad {}",
+        "{link} · {:.1} Hz · late {:.1} ms (99 %: {:.1}) · lost {} · bad {}",
         status.rate_hz,
         status.delays.p50.milliseconds(),
         status.delays.p99.milliseconds(),
@@ -354,7 +368,7 @@ fn summary(source: &LineSource, status: &FeedStatus, watched: &Watched) -> Strin
             ),
         ),
     ];
-    if !matches!(source, LineSource::File(_)) {
+    if matches!(source, LineSource::Port(_)) {
         rows.push((
             "line",
             format!(
@@ -371,9 +385,12 @@ fn summary(source: &LineSource, status: &FeedStatus, watched: &Watched) -> Strin
                 status.delays.max.milliseconds()
             ),
         ));
-        if let Some(clock) = status.clock {
-            rows.push(("clock", format!("the arm's runs slow by {:.1} ppm", clock.drift_ppm)));
-        }
+        let drift = match status.clock.and_then(|clock| clock.drift_ppm) {
+            Some(ppm) if ppm < 0.0 => format!("the arm's runs fast by {:.1} ppm", -ppm),
+            Some(ppm) => format!("the arm's runs slow by {ppm:.1} ppm"),
+            None => "drift not known yet: it takes 10 s".to_owned(),
+        };
+        rows.push(("clock", drift));
     }
     if c.with_faults > 0 {
         rows.push(("faults", format!("in {} messages", c.with_faults)));
@@ -398,6 +415,10 @@ fn why_nothing_came(source: &LineSource, status: &FeedStatus) -> String {
     let counts = &status.statistics;
     match &status.link {
         LinkState::Absent(reason) => reason.clone(),
+        _ if counts.refused_joints > 0 => format!(
+            "messages came, but {}; is --arm the right table of joints?",
+            status.refusal.as_deref().unwrap_or("the joints cannot be")
+        ),
         _ if refused(counts) > 0 => format!(
             "messages came, but no pose could be taken: {}",
             status.refusal.as_deref().unwrap_or("refused")

@@ -31,8 +31,8 @@ const LARGEST_STEP: Span = Span(3_000_000_000);
 pub struct ClockEstimate {
     /// The host's time less the device's, now.
     pub offset: Span,
-    /// How much faster the host's clock runs than the device's, parts per million.
-    pub drift_ppm: f64,
+    /// How much faster the host's clock runs than the device's, parts per million; `None` until it is known.
+    pub drift_ppm: Option<f64>,
 }
 
 /// A device's time carried to the host.
@@ -138,7 +138,7 @@ impl DeviceClock {
         let offset = self.offset_at(device.saturating_sub(self.origin.0))?;
         Some(ClockEstimate {
             offset: Span(self.origin.1.saturating_sub(self.origin.0).saturating_add(offset)),
-            drift_ppm: self.drift * 1e6,
+            drift_ppm: (self.bins.len() > FEWEST_DRIFT_BINS).then_some(self.drift * 1e6),
         })
     }
 
@@ -274,7 +274,7 @@ mod tests {
         // noise over 30 s and more is good to 0.02 ms·√2/15 s ≈ 2 ppm, which over the ten seconds of the offset makes 0.02 ms.
         assert!(worst < 0.1, "worst {worst} ms");
         assert!((sum / count).abs() < 0.03, "mean {} ms", sum / count);
-        let drift = clock.estimate().unwrap().drift_ppm;
+        let drift = clock.estimate().unwrap().drift_ppm.unwrap();
         // Over 120 s: 0.02 ms·√2/60 s, less for the median of sixty.
         assert!((drift - 80.0).abs() < 1.0, "{drift} ppm");
     }

@@ -268,6 +268,9 @@ impl Reader {
             looked: now,
         };
         self.intake.statistics().opened += 1;
+        if self.intake.statistics().opened > 1 {
+            tracing::info!("arm: the line is back");
+        }
         self.set_link(LinkState::Silent);
         self.tell();
         let mut buffer = [0; READ_BYTES];
