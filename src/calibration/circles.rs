@@ -98,6 +98,19 @@ pub fn detect(gray: &Image<f32>, layout: &BoardLayout, diameter_mm: Option<f64>)
     })
 }
 
+/// How many dots stand out.
+pub fn dots(gray: &Image<f32>) -> usize {
+    let soft = smoothed(gray);
+    let count = |window: f64, dark: bool| {
+        let found = blobs(&soft, window, dark);
+        found.iter().filter(|blob| rimmed(&soft, blob, dark).is_some()).count()
+    };
+    let counts = WINDOWS
+        .into_iter()
+        .flat_map(|window| [true, false].map(|dark| count(window, dark)));
+    counts.max().unwrap_or(0)
+}
+
 /// Elliptic regions darker (or brighter) than what is around.
 fn blobs(soft: &Image<f32>, window: f64, dark: bool) -> Vec<Blob> {
     let (width, height) = soft.size();

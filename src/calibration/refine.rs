@@ -32,6 +32,13 @@ const LEAST_DEVIATION_PX: f64 = 0.04;
 /// Views and corners per view that a start is judged by.
 const TRIAL_VIEWS: usize = 16;
 const TRIAL_CORNERS: usize = 40;
+/// k4, k5 and k6 of the rational model can run away together with k1, k2 and k3, the picture staying the same: a deviation of so much
+/// keeps them where coefficients of lenses are, and weighs nothing beside corners that tell them.
+const DENOMINATOR_DEVIATION: f64 = 10.0;
+/// The deviation of corners that this prior is measured by, px.
+const PRIOR_PX: f64 = 0.2;
+/// Place of k4 in the rational model.
+const FIRST_DENOMINATOR: usize = 9;
 /// A view keeps at least so many corners, or it is left out as a whole.
 const FEWEST_CORNERS: usize = 6;
 
@@ -132,11 +139,22 @@ impl Problem for AllViews<'_> {
     fn measured(&self) -> usize {
         2 * self.corners()
     }
+    fn priors(&self) -> usize {
+        if self.model == LensModel::RationalPolynomial { 3 } else { 0 }
+    }
     fn loss(&self) -> RobustLoss {
         self.loss
     }
     fn residuals(&self, state: &State, rows: Range<usize>, out: &mut [f64]) {
-        let (first, last) = (rows.start / 2, rows.end / 2);
+        let seen = rows.end.min(self.measured()).saturating_sub(rows.start);
+        let (out, priors) = out.split_at_mut(seen);
+        // The first prior asked for; a range that ends among the corners asks for none.
+        let first_prior = rows.start.saturating_sub(self.measured());
+        for (number, out) in priors.iter_mut().enumerate() {
+            let k = lens::parameter(&state.camera, self.model, FIRST_DENOMINATOR + first_prior + number);
+            *out = k / DENOMINATOR_DEVIATION * PRIOR_PX;
+        }
+        let (first, last) = (rows.start / 2, rows.end.min(self.measured()) / 2);
         let mut out = out.chunks_exact_mut(2);
         for (number, view) in self.views.iter().enumerate() {
             let (begin, end) = (self.offsets[number], self.offsets[number + 1]);
@@ -167,7 +185,7 @@ impl Problem for AllViews<'_> {
     }
     fn support(&self, direction: usize) -> Vec<Range<usize>> {
         let Some(view) = direction.checked_sub(self.free.len()).map(|pose| pose / 6) else {
-            let everything = 0..self.measured();
+            let everything = 0..self.measured() + self.priors();
             return vec![everything];
         };
         vec![2 * self.offsets[view]..2 * self.offsets[view + 1]]
@@ -239,6 +257,7 @@ fn result(
     let covariance = scaled
         .as_ref()
         .map(|full| full.view((0, 0), (lens_count, lens_count)).into_owned());
+    let squares: f64 = solution.residuals.iter().take(2 * used).map(|r| r * r).sum();
     let free = 2.0 * used as f64 - lens_count as f64 - 6.0 * usable.len() as f64;
     let mut results: Vec<ViewResult> = views
         .iter()
@@ -273,8 +292,8 @@ fn result(
         camera: solution.state.camera.clone(),
         model,
         covariance,
-        sigma_px: (solution.cost / free.max(1.0)).sqrt(),
-        rms_px: (solution.cost / used.max(1) as f64).sqrt(),
+        sigma_px: (squares / free.max(1.0)).sqrt(),
+        rms_px: (squares / used.max(1) as f64).sqrt(),
         views: results,
         iterations: solution.iterations,
     }
