@@ -167,7 +167,7 @@ fn largest(found: &[Saddle], layout: &BoardLayout) -> Option<Placed> {
 fn seed(found: &[Saddle], first: usize) -> Option<Seed> {
     let start = &found[first];
     let mut steps = [[0.0; 2]; 2];
-    for axis in 0..2 {
+    for (axis, step) in steps.iter_mut().enumerate() {
         let along = start.edges[axis];
         let nearest = found
             .iter()
@@ -188,7 +188,7 @@ fn seed(found: &[Saddle], first: usize) -> Option<Seed> {
             along
         };
         let sense = (nearest[0] * along.cos() + nearest[1] * along.sin()).signum();
-        steps[axis] = [nearest[0] * sense, nearest[1] * sense];
+        *step = [nearest[0] * sense, nearest[1] * sense];
     }
     let (a, b) = (steps[0][0].hypot(steps[0][1]), steps[1][0].hypot(steps[1][1]));
     (a < 6.0 * b && b < 6.0 * a).then_some(Seed { feature: first, steps })

@@ -184,11 +184,11 @@ impl Problem for AllViews<'_> {
         moved
     }
     fn support(&self, direction: usize) -> Vec<Range<usize>> {
-        let Some(view) = direction.checked_sub(self.free.len()).map(|pose| pose / 6) else {
-            let everything = 0..self.measured() + self.priors();
-            return vec![everything];
+        let rows = match direction.checked_sub(self.free.len()) {
+            Some(pose) => 2 * self.offsets[pose / 6]..2 * self.offsets[pose / 6 + 1],
+            None => 0..self.measured() + self.priors(),
         };
-        vec![2 * self.offsets[view]..2 * self.offsets[view + 1]]
+        std::iter::once(rows).collect()
     }
     fn small_step(&self, direction: usize) -> f64 {
         match self.free.get(direction) {
