@@ -11,6 +11,7 @@ use toml::{Table, Value};
 
 use crate::image::{field_of_view, specularity};
 use crate::light_field::prior::PriorSettings;
+use crate::robot::feed;
 use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::{color_normalization, pose_refinement, specularity_substitution, temporal_median, undistortion};
 
@@ -130,6 +131,8 @@ pub struct Config {
     pub undistort: undistortion::Settings,
     /// What counts as a specularity, and what as steel.
     pub specularity: specularity::Settings,
+    /// How the arm is connected.
+    pub arm: feed::settings::Settings,
     /// The arm's poses between its samples.
     pub poses: pose_buffer::Settings,
     /// How far a survey's poses are trusted while a light field is built.
@@ -211,6 +214,7 @@ impl Config {
             return Err(format!("undistort.balance: expected 0 to 1, found {balance}"));
         }
         PoseBuffer::new(&self.poses).map(|_| ()).map_err(|error| error.to_string())?;
+        self.arm.check()?;
         self.survey.check()?;
         // Amounts, reaches and shares: none of them can be negative, and no setting at all can be infinite or no number.
         let tree = Table::try_from(self).map_err(|error| error.to_string())?;

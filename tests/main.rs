@@ -14,6 +14,8 @@ mod cli;
 mod color;
 mod config;
 mod determinism;
+mod feed;
+mod feed_fuzz;
 mod import;
 mod light_field;
 mod media;

@@ -1,4 +1,4 @@
-//! Calibration: cameras from pictures of a board.
+//! Calibration: what a camera is, how it sits on the arm, how far the clocks are apart, and what its colours mean; each with its errors.
 
 pub mod board;
 pub mod charuco;
@@ -9,6 +9,7 @@ pub mod coverage;
 pub mod cross_validation;
 pub mod detection;
 pub mod error;
+pub mod hand_eye;
 pub mod homography;
 pub mod lattice;
 pub mod lens;
@@ -22,4 +23,5 @@ pub mod pose;
 pub mod refine;
 pub mod report;
 pub mod saddle;
+pub mod time_offset;
 pub mod zhang;

@@ -218,6 +218,70 @@ impl Progress for Console {
     }
 }
 
+/// How something goes on that has no end of its own: a line rewritten in place on a terminal, else a line now and then.
+#[derive(Debug)]
+pub struct LiveLine<'a> {
+    console: &'a Console,
+    bar: Option<ProgressBar>,
+    told: Option<Timestamp>,
+}
+
+impl Console {
+    /// A line that is rewritten until it is dropped.
+    pub fn live_line(&self) -> LiveLine<'_> {
+        let bar = (self.look == Look::Bar).then(|| {
+            let bar = self.bars.add(ProgressBar::new_spinner());
+            bar.set_style(ProgressStyle::with_template("{wide_msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
+            bar
+        });
+        LiveLine {
+            console: self,
+            bar,
+            told: None,
+        }
+    }
+}
+
+impl LiveLine<'_> {
+    /// The present state, as text for people and as JSON for machines; may be called as often as one likes.
+    pub fn update(&mut self, text: impl FnOnce() -> String, json: impl FnOnce() -> serde_json::Value) {
+        if let Some(bar) = &self.bar {
+            bar.set_message(text());
+            return;
+        }
+        let every = match self.console.look {
+            Look::Json => JSON_EVERY,
+            Look::Lines => LINE_EVERY,
+            Look::Bar | Look::Nothing => return,
+        };
+        let now = MonotonicClock.now();
+        if self.told.is_none_or(|told| now - told >= every) {
+            self.told = Some(now);
+            self.console.say(&if self.console.look == Look::Json {
+                json().to_string()
+            } else {
+                text()
+            });
+        }
+    }
+
+    /// The last state, for machines; people are told otherwise.
+    pub fn last(&mut self, json: impl FnOnce() -> serde_json::Value) {
+        if self.console.look == Look::Json {
+            self.console.say(&json().to_string());
+        }
+    }
+}
+
+impl Drop for LiveLine<'_> {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+            self.console.bars.remove(bar);
+        }
+    }
+}
+
 /// Writes to stderr while the bars step aside.
 #[derive(Clone, Debug)]
 struct AroundBars(MultiProgress);

@@ -1,6 +1,7 @@
 //! The commands; the only place that prints.
 
 pub mod calibrate;
+pub mod arm;
 pub mod console;
 pub mod context;
 pub mod demo;
@@ -52,6 +53,7 @@ enum Command {
     Process(process::Args),
     LightField(light_field::Args),
     Simulate(simulate::Args),
+    Arm(arm::Args),
 }
 
 /// Run the command line; its outcome as the process's exit code.
@@ -119,6 +121,7 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
             light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete)
         }
         Command::Simulate(args) => simulate::run(args, context),
+        Command::Arm(args) => arm::run(&args, context),
     }
 }
 

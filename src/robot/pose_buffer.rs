@@ -138,11 +138,16 @@ impl PoseBuffer {
             return false;
         }
         let oldest_kept = sample.stamp - Span::from_milliseconds(self.settings.kept_ms);
-        while self.samples.front().is_some_and(|first| first.stamp < oldest_kept) {
+        while self.samples.front().is_some_and(|first| first.stamp < oldest_kept) || self.samples.len() >= MOST_SAMPLES {
             self.samples.pop_front();
         }
         self.samples.push_back(sample);
         true
+    }
+
+    /// Forget all samples: the arm's clock runs anew.
+    pub fn clear(&mut self) {
+        self.samples.clear();
     }
 
     /// The samples kept.
@@ -264,6 +269,8 @@ impl PoseBuffer {
     }
 }
 
+/// However long samples are kept and however fast they come, an endless feed takes no more memory than this many (8 MB).
+const MOST_SAMPLES: usize = 1 << 17;
 /// Below this a fit averages nothing.
 const FEWEST_SAMPLES: usize = 4;
 /// A parabola through fewer would follow their noise.
@@ -512,6 +519,60 @@ mod tests {
         });
         assert_eq!(buffer.pose_at(Timestamp(0)).unwrap().origin, Origin::Measured);
         assert_eq!(buffer.pose_at(Timestamp(10_000_000)).unwrap().origin, Origin::Predicted);
+    }
+
+    /// Halfway in time is halfway along the line and half the turn (Shoemake 1985: SLERP at ½ is the normalized sum).
+    #[test]
+    fn between_two_samples_lies_the_straight_line_and_the_great_arc() {
+        let (a, b) = (motion(0.0, 1.0), motion(1.0, 1.0));
+        let mut buffer = PoseBuffer::new(&interpolating()).unwrap();
+        for (ms, base_from_hand) in [(0.0, a), (100.0, b)] {
+            let stamp = Timestamp(0) + Span::from_milliseconds(ms);
+            assert!(buffer.push(TimedPose { stamp, base_from_hand }));
+        }
+        let pose = buffer.pose_at(Timestamp(50_000_000)).unwrap().base_from_hand;
+        assert!((pose.translation() - (a.translation() + b.translation()) / 2.0).amax() < 1e-9);
+        let sum = a.rotation().coords + b.rotation().coords;
+        assert!((pose.rotation().coords - sum.normalize()).amax() < 1e-12);
+        // Carried on: as far again beyond the end as the setting allows, marked, and no farther.
+        let beyond = buffer.pose_at(Timestamp(150_000_000)).unwrap();
+        assert_eq!(beyond.origin, Origin::Predicted);
+        assert!((beyond.base_from_hand.translation() - (b.translation() * 1.5 - a.translation() * 0.5)).amax() < 1e-9);
+        assert!(matches!(
+            buffer.pose_at(Timestamp(150_000_001)),
+            Err(PoseLookupError::NotYet(Span(50_000_001)))
+        ));
+    }
+
+    #[test]
+    fn an_endless_feed_takes_bounded_memory() {
+        let settings = Settings {
+            kept_ms: 1e7,
+            ..Settings::default()
+        };
+        let mut buffer = PoseBuffer::new(&settings).unwrap();
+        for i in 0..3 * MOST_SAMPLES as i64 {
+            let stamp = Timestamp(i);
+            assert!(buffer.push(TimedPose {
+                stamp,
+                base_from_hand: Transform::identity()
+            }));
+        }
+        assert_eq!(buffer.samples().count(), MOST_SAMPLES);
+        assert!(buffer.samples.capacity() <= 2 * MOST_SAMPLES);
+        let kept = PoseBuffer::new(&Settings::default()).map(|mut buffer| {
+            for i in 0..100_000 {
+                buffer.push(TimedPose {
+                    stamp: Timestamp(i * 10_000_000),
+                    base_from_hand: Transform::identity(),
+                });
+            }
+            buffer.samples().count()
+        });
+        // Ten seconds at 100 Hz, both ends.
+        assert_eq!(kept.unwrap(), 1001);
+        buffer.clear();
+        assert_eq!(buffer.pose_at(Timestamp(0)).unwrap_err(), PoseLookupError::Empty);
     }
 
     #[test]

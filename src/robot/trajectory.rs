@@ -3,7 +3,6 @@
 //! The layout of the TUM RGB-D benchmark (Sturm et al. 2012): `timestamp_s tx ty tz qx qy qz qw` a line. The benchmark knows
 //! metres and no transform; here a comment line says both: `# T_base_hand, mm`.
 
-use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
@@ -289,24 +288,39 @@ fn pose_of_line(line: &str, mm_per_unit: f64) -> Result<(Timestamp, Isometry3<f6
     Ok((Timestamp::from_seconds(v[0]), Isometry3::from_parts(translation, rotation)))
 }
 
+/// The first lines of a file in TUM layout; `transform` as in `T_base_hand`.
+pub fn tum_head(transform: &str) -> String {
+    format!("# {transform}, mm\n# timestamp_s tx ty tz qx qy qz qw\n")
+}
+
+/// A stamp as files hold it, s.
+pub fn stamp_text(stamp: Timestamp) -> String {
+    let (seconds, nanoseconds) = (stamp.0.div_euclid(1_000_000_000), stamp.0.rem_euclid(1_000_000_000));
+    // Negative stamps hardly occur but must not be garbled.
+    if seconds >= 0 {
+        format!("{seconds}.{nanoseconds:09}")
+    } else {
+        format!("{:.9}", stamp.seconds())
+    }
+}
+
+/// A line of a file in TUM layout, mm.
+pub fn tum_line(stamp: Timestamp, pose: &Isometry3<f64>) -> String {
+    let t = pose.translation.vector;
+    let [x, y, z, w] = xyzw_from_rotation(&pose.rotation);
+    let stamp = stamp_text(stamp);
+    format!("{stamp} {:.6} {:.6} {:.6} {x:.12} {y:.12} {z:.12} {w:.12}\n", t.x, t.y, t.z)
+}
+
 /// Write poses (mm) in TUM layout; `transform` as in `T_base_hand`. An existing file is replaced.
 pub fn write_tum(
     path: &Path,
     transform: &str,
     poses: impl Iterator<Item = (Timestamp, Isometry3<f64>)>,
 ) -> Result<(), TrajectoryError> {
-    let mut text = format!("# {transform}, mm\n# timestamp_s tx ty tz qx qy qz qw\n");
+    let mut text = tum_head(transform);
     for (stamp, pose) in poses {
-        let t = pose.translation.vector;
-        let [x, y, z, w] = xyzw_from_rotation(&pose.rotation);
-        let (seconds, nanoseconds) = (stamp.0.div_euclid(1_000_000_000), stamp.0.rem_euclid(1_000_000_000));
-        // Writing to a String cannot fail. Negative stamps do not occur but must not be garbled.
-        let _ = if seconds >= 0 {
-            write!(text, "{seconds}.{nanoseconds:09}")
-        } else {
-            write!(text, "{:.9}", stamp.seconds())
-        };
-        let _ = writeln!(text, " {:.6} {:.6} {:.6} {x:.12} {y:.12} {z:.12} {w:.12}", t.x, t.y, t.z);
+        text.push_str(&tum_line(stamp, &pose));
     }
     std::fs::write(path, text).map_err(|source| TrajectoryError::Unwritable {
         path: path.to_owned(),
