@@ -498,3 +498,34 @@ fn dot_bias_px(camera: &CameraModel, pose: &Transform<Camera, Board>, middle: Po
     }
     (area.abs() > 1e-9).then(|| [sum[0] / area, sum[1] / area])
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{UnitQuaternion, Vector3};
+
+    use super::*;
+
+    #[test]
+    fn the_middle_of_a_dots_picture_is_where_the_ellipse_has_its_centre() {
+        let intrinsics = Intrinsics {
+            fx: 800.0,
+            fy: 800.0,
+            cx: 320.0,
+            cy: 240.0,
+        };
+        let camera = LensModel::PlumbBob.camera(640, 480, intrinsics);
+        let turn = UnitQuaternion::from_euler_angles(0.7, 0.4, 0.2);
+        let pose: Transform<Camera, Board> = Transform::new(turn, Vector3::new(-3.0, 2.0, 60.0));
+        let (x, y, r) = (4.0, -3.0, 3.0);
+        let bias = dot_bias_px(&camera, &pose, Point::new(x, y, 0.0), r).unwrap();
+        let rotation = turn.to_rotation_matrix();
+        let columns = [rotation.matrix().column(0).into(), rotation.matrix().column(1).into(), pose.translation()];
+        let map = intrinsics.matrix() * Matrix3::from_columns(&columns);
+        let dual = Matrix3::new(x * x - r * r, x * y, x, x * y, y * y - r * r, y, x, y, 1.0);
+        let pole = map * dual * map.transpose() * Vector3::z();
+        let seen = camera.project(pose * Point::<Board>::new(x, y, 0.0)).unwrap();
+        let truth = [pole.x / pole.z - seen.x, pole.y / pole.z - seen.y];
+        assert!(truth[0].hypot(truth[1]) > 0.5, "a case that matters: {truth:?}");
+        assert!((bias[0] - truth[0]).hypot(bias[1] - truth[1]) < 0.02, "{bias:?} {truth:?}");
+    }
+}

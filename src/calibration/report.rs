@@ -186,6 +186,14 @@ impl Report {
                 difference.median_px
             ));
         }
+        if circumstances.namings.iter().all(|naming| *naming == Naming::Shifted) {
+            let most = views.iter().map(|view| view.corners).max().unwrap_or(0);
+            warnings.push(format!(
+                "no picture shows just the whole board: {most} corners at most were found; that does no harm to the camera, but check that \
+                 {} counts its columns and rows rightly (of a checkerboard, inner corners)",
+                circumstances.board
+            ));
+        }
         let covariance = calibration.covariance.as_ref();
         Self {
             version: env!("CARGO_PKG_VERSION"),
