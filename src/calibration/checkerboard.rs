@@ -242,7 +242,12 @@ fn refined(gray: &Image<f32>, sites: &[Site], starts: &BTreeMap<usize, Rough>) -
 }
 
 fn drop_strays(sites: &[Site], corners: &mut BTreeMap<usize, FittedCorner>) {
-    let kept = without_strays(corners.iter().map(|(site, corner)| (sites[*site].lattice, corner.pixel)).collect());
+    let kept = without_strays(
+        corners
+            .iter()
+            .map(|(site, corner)| (sites[*site].lattice, corner.pixel))
+            .collect(),
+    );
     corners.retain(|site, _| kept.contains_key(&sites[*site].lattice));
 }
 

@@ -402,7 +402,10 @@ mod tests {
             for x in 0..420 {
                 let mut sum = 0.0;
                 for k in 0..25 {
-                    let at = [f64::from(x) + (f64::from(k % 5) - 2.0) / 5.0, f64::from(y) + (f64::from(k / 5) - 2.0) / 5.0];
+                    let at = [
+                        f64::from(x) + (f64::from(k % 5) - 2.0) / 5.0,
+                        f64::from(y) + (f64::from(k / 5) - 2.0) / 5.0,
+                    ];
                     let [u, v] = mapped(&back, at).unwrap();
                     let nearest = sites
                         .iter()
@@ -426,7 +429,17 @@ mod tests {
     fn ellipse_center(map: &Matrix3<f64>, at: [f64; 2], radius: f64) -> [f64; 2] {
         let [x, y] = at;
         // The dual conic of the circle, carried over by the map.
-        let dual = Matrix3::new(x * x - radius * radius, x * y, x, x * y, y * y - radius * radius, y, x, y, 1.0);
+        let dual = Matrix3::new(
+            x * x - radius * radius,
+            x * y,
+            x,
+            x * y,
+            y * y - radius * radius,
+            y,
+            x,
+            y,
+            1.0,
+        );
         let pole = map * dual * map.transpose() * Vector3::z();
         [pole.x / pole.z, pole.y / pole.z]
     }
@@ -449,7 +462,10 @@ mod tests {
             let n = detection.corners.len() as f64;
             let (error, stated) = ((squares / n).sqrt(), (stated / n).sqrt());
             // What noise lets the rim waver, and a hundredth of a pixel for steps found on a grid.
-            assert!(error < 1.6 * stated + 0.02 && error < 0.12, "{text}: {error} px, stated {stated} px");
+            assert!(
+                error < 1.6 * stated + 0.02 && error < 0.12,
+                "{text}: {error} px, stated {stated} px"
+            );
             let radius = detection.dot_radius_mm.unwrap();
             assert!((radius - 0.28).abs() < 0.015, "{text}: {radius}");
         }

@@ -34,7 +34,7 @@ const TRIAL_VIEWS: usize = 16;
 const TRIAL_CORNERS: usize = 40;
 /// k4, k5 and k6 of the rational model can run away together with k1, k2 and k3, the picture staying the same: a deviation of so much
 /// keeps them where coefficients of lenses are, and weighs nothing beside corners that tell them.
-const DENOMINATOR_DEVIATION: f64 = 10.0;
+const DENOMINATOR_DEVIATION: f64 = 100.0;
 /// The deviation of corners that this prior is measured by, px.
 const PRIOR_PX: f64 = 0.2;
 /// Place of k4 in the rational model.
@@ -519,7 +519,11 @@ mod tests {
         let (x, y, r) = (4.0, -3.0, 3.0);
         let bias = dot_bias_px(&camera, &pose, Point::new(x, y, 0.0), r).unwrap();
         let rotation = turn.to_rotation_matrix();
-        let columns = [rotation.matrix().column(0).into(), rotation.matrix().column(1).into(), pose.translation()];
+        let columns = [
+            rotation.matrix().column(0).into(),
+            rotation.matrix().column(1).into(),
+            pose.translation(),
+        ];
         let map = intrinsics.matrix() * Matrix3::from_columns(&columns);
         let dual = Matrix3::new(x * x - r * r, x * y, x, x * y, y * y - r * r, y, x, y, 1.0);
         let pole = map * dual * map.transpose() * Vector3::z();
