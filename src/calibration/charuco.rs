@@ -16,6 +16,7 @@ use crate::calibration::marker::Dictionary;
 use crate::calibration::marker_search::{FoundMarker, markers};
 use crate::calibration::pattern_fit::{FittedSite, fitted, typical_blur_px};
 use crate::calibration::placement::Naming;
+use crate::calibration::stray::without_strays;
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::image::buffer::Image;
@@ -280,31 +281,9 @@ fn followed(gray: &Image<f32>, print: &Print, anchors: &[Anchor], layout: &Board
             }
         }
     }
-    without_strays(sites, s)
-}
-
-/// Corners that do not lie where their neighbours say.
-fn without_strays(sites: BTreeMap<[i32; 2], FittedSite>, s: f64) -> BTreeMap<[i32; 2], FittedSite> {
-    let place = |[column, row]: [i32; 2]| [f64::from(column) * s, f64::from(row) * s];
-    let stays = |site: &[i32; 2], fit: &FittedSite| {
-        let near: Vec<_> = (-2..=2)
-            .flat_map(|v| (-2..=2).map(move |u| [site[0] + u, site[1] + v]))
-            .filter(|at| at != site)
-            .filter_map(|at| sites.get(&at).map(|fit| (place(at), [fit.pixel.x, fit.pixel.y])))
-            .collect();
-        let Some(map) = from_pairs(&near).filter(|_| near.len() >= 5) else {
-            return false;
-        };
-        mapped(&map, place(*site)).is_some_and(|p| {
-            let stray = (p[0] - fit.pixel.x).hypot(p[1] - fit.pixel.y);
-            stray < (0.08 * fit.square_px).max(0.8)
-        })
-    };
+    let kept = without_strays(sites.iter().map(|(site, fit)| (*site, fit.pixel)).collect());
+    sites.retain(|site, _| kept.contains_key(site));
     sites
-        .iter()
-        .filter(|(site, fit)| stays(site, fit))
-        .map(|(site, fit)| (*site, *fit))
-        .collect()
 }
 
 #[cfg(test)]

@@ -13,6 +13,7 @@ use crate::calibration::detection::{BoardCorner, Detection};
 use crate::calibration::lattice::{Cell, Lattice, Seed, grown};
 use crate::calibration::placement::{Placed, placed};
 use crate::calibration::saddle::{Saddle, saddles};
+use crate::calibration::stray::without_strays;
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::image::buffer::Image;
@@ -68,7 +69,9 @@ pub fn detect(gray: &Image<f32>, layout: &BoardLayout) -> Option<Detection> {
         })
         .collect();
     let mut corners = refined(gray, &sites, &starts);
+    drop_strays(&sites, &mut corners);
     complete(gray, &sites, &mut corners);
+    drop_strays(&sites, &mut corners);
     if corners.len() < FEWEST_CORNERS.min(sites.len()) {
         return None;
     }
@@ -167,7 +170,7 @@ fn largest(found: &[Saddle], layout: &BoardLayout) -> Option<Placed> {
 fn seed(found: &[Saddle], first: usize) -> Option<Seed> {
     let start = &found[first];
     let mut steps = [[0.0; 2]; 2];
-    for axis in 0..2 {
+    for (axis, step) in steps.iter_mut().enumerate() {
         let along = start.edges[axis];
         let nearest = found
             .iter()
@@ -188,7 +191,7 @@ fn seed(found: &[Saddle], first: usize) -> Option<Seed> {
             along
         };
         let sense = (nearest[0] * along.cos() + nearest[1] * along.sin()).signum();
-        steps[axis] = [nearest[0] * sense, nearest[1] * sense];
+        *step = [nearest[0] * sense, nearest[1] * sense];
     }
     let (a, b) = (steps[0][0].hypot(steps[0][1]), steps[1][0].hypot(steps[1][1]));
     (a < 6.0 * b && b < 6.0 * a).then_some(Seed { feature: first, steps })
@@ -236,6 +239,16 @@ fn refined(gray: &Image<f32>, sites: &[Site], starts: &BTreeMap<usize, Rough>) -
             Some((*site, fitted(gray, &start)?))
         })
         .collect()
+}
+
+fn drop_strays(sites: &[Site], corners: &mut BTreeMap<usize, FittedCorner>) {
+    let kept = without_strays(
+        corners
+            .iter()
+            .map(|(site, corner)| (sites[*site].lattice, corner.pixel))
+            .collect(),
+    );
+    corners.retain(|site, _| kept.contains_key(&sites[*site].lattice));
 }
 
 /// Corners that the search missed (a specularity, a shadow) are fitted where their neighbours say.

@@ -8,9 +8,12 @@ use nalgebra::Vector3;
 use crate::calibration::lens;
 use crate::calibration::refine::Calibration;
 use crate::camera::intrinsics::Pixel;
+use crate::image::buffer::{Image, Rgb8};
 
 /// Columns of the coarse grid that coverage is counted on; rows follow the picture's shape.
 const COLUMNS: usize = 12;
+/// A cell never brighter than this on average lies outside the scope's round field, gray levels.
+const BLACK_LEVEL: f32 = 12.0;
 /// Fewer views than this leave little to check one against the other.
 const FEW_VIEWS: usize = 8;
 /// Covered less than this of the picture, its outer parts are guessed.
@@ -23,7 +26,7 @@ const ONE_SIDED: f64 = 0.75;
 /// How well the views cover the camera.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Coverage {
-    /// Share of the picture's cells with a corner in or next to them.
+    /// Share of the image field's cells with a corner in or next to them.
     pub share: f64,
     /// The same for the four quarters: left top, right top, left bottom, right bottom.
     pub quarters: [f64; 4],
@@ -38,11 +41,50 @@ pub struct Coverage {
     pub hull: Vec<Pixel>,
 }
 
-/// Coverage of the corners used.
-pub fn coverage(calibration: &Calibration) -> Coverage {
+/// Cells that light falls on, put together from all pictures.
+#[derive(Clone, Debug, Default)]
+pub struct Lit(Vec<bool>);
+
+impl Lit {
+    /// Of one picture.
+    pub fn of(image: &Image<Rgb8>) -> Self {
+        let (width, height) = image.size();
+        let rows = rows_of(width, height);
+        let (mut sums, mut counts) = (vec![0.0_f32; COLUMNS * rows], vec![0.0_f32; COLUMNS * rows]);
+        for y in (0..height).step_by(4) {
+            for (x, pixel) in image.row(y).iter().enumerate().step_by(4) {
+                let cell = (y * rows / height) * COLUMNS + x * COLUMNS / width;
+                sums[cell] += f32::from(pixel[1]);
+                counts[cell] += 1.0;
+            }
+        }
+        Self(
+            sums.iter()
+                .zip(&counts)
+                .map(|(sum, count)| *sum > BLACK_LEVEL * count)
+                .collect(),
+        )
+    }
+
+    /// Cells lit in either.
+    pub fn or(mut self, other: &Self) -> Self {
+        self.0.resize(self.0.len().max(other.0.len()), false);
+        for (cell, lit) in self.0.iter_mut().zip(&other.0) {
+            *cell |= lit;
+        }
+        self
+    }
+}
+
+fn rows_of(width: usize, height: usize) -> usize {
+    (COLUMNS * height).div_ceil(width.max(1)).max(2)
+}
+
+/// Coverage of the corners used, in the part of the picture that was ever lit.
+pub fn coverage(calibration: &Calibration, lit: &Lit) -> Coverage {
     let camera = &calibration.camera;
     let used: Vec<Pixel> = used_pixels(calibration).collect();
-    let rows = (COLUMNS * camera.height).div_ceil(camera.width.max(1)).max(2);
+    let rows = rows_of(camera.width, camera.height);
     let mut seen = vec![false; COLUMNS * rows];
     for pixel in &used {
         let u = (pixel.x / camera.width as f64 * COLUMNS as f64).floor() as i64;
@@ -54,6 +96,9 @@ pub fn coverage(calibration: &Calibration) -> Coverage {
     let mut counts = [[0.0_f64; 2]; 4];
     for v in 0..rows {
         for u in 0..COLUMNS {
+            if lit.0.get(v * COLUMNS + u) == Some(&false) && !seen[v * COLUMNS + u] {
+                continue;
+            }
             let near = (v.saturating_sub(1)..=(v + 1).min(rows - 1))
                 .any(|y| (u.saturating_sub(1)..=(u + 1).min(COLUMNS - 1)).any(|x| (x == u || y == v) && seen[y * COLUMNS + x]));
             let quarter = 2 * usize::from(2 * v >= rows) + usize::from(2 * u >= COLUMNS);
@@ -93,7 +138,7 @@ pub fn warnings(calibration: &Calibration, coverage: &Coverage) -> Vec<String> {
     }
     if coverage.share < POOR_SHARE {
         warnings.push(format!(
-            "corners cover {:.0} % of the picture: the lens is a guess beyond {:.0} px from its middle; bring the board to the border too",
+            "corners cover {:.0} % of the image field: the lens is a guess beyond {:.0} px from its middle; bring the board to the border too",
             coverage.share * 100.0,
             coverage.reach_px
         ));

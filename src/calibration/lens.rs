@@ -69,12 +69,7 @@ pub fn add(camera: &mut CameraModel, model: LensModel, place: usize, amount: f64
     }
 }
 
-/// About the size of a number, from which a small step follows.
-pub fn scale(camera: &CameraModel, place: usize) -> f64 {
-    if place < 4 { camera.intrinsics.fx } else { 1.0 }
-}
-
-fn slot<'a>(camera: &'a mut CameraModel, model: LensModel, place: usize) -> Option<&'a mut f64> {
+fn slot(camera: &mut CameraModel, model: LensModel, place: usize) -> Option<&mut f64> {
     match (*model.names().get(place)?, &mut camera.distortion) {
         ("fx", _) => Some(&mut camera.intrinsics.fx),
         ("fy", _) => Some(&mut camera.intrinsics.fy),

@@ -23,5 +23,6 @@ pub mod pose;
 pub mod refine;
 pub mod report;
 pub mod saddle;
+pub mod stray;
 pub mod time_offset;
 pub mod zhang;

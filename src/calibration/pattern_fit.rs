@@ -20,8 +20,6 @@ pub struct FittedSite {
     pub sigma_px: f64,
     /// How alike print and picture are, −1…1.
     pub likeness: f64,
-    /// Side of a square there, px.
-    pub square_px: f64,
 }
 
 /// The patch of print laid over the picture reaches so many squares to each side.
@@ -37,6 +35,8 @@ const LEAST_LIKENESS: f64 = 0.8;
 const MOST_STEPS: usize = 25;
 /// Squares smaller than this cannot be told from noise, px.
 const LEAST_SQUARE_PX: f64 = 6.0;
+/// Pixels looked at across a patch; of larger ones some are passed over.
+const MOST_SAMPLES_ACROSS: f64 = 36.0;
 /// Blurs tried, px.
 const BLURS_PX: [f64; 6] = [0.6, 0.9, 1.3, 1.8, 2.5, 3.5];
 /// Corners that the blur is judged by.
@@ -159,6 +159,7 @@ pub fn fitted(
         return None;
     }
     let patch = Patch::new(print, center_mm, square_mm, blur_px / px_per_mm);
+    let every = (2.0 * REACH * square_px / MOST_SAMPLES_ACROSS).ceil().max(1.0) as usize;
     let (mut at, mut frame) = (Vector2::new(start.x, start.y), *frame);
     let (mut gain, mut offset) = (0.0, 0.0);
     let mut sums = None;
@@ -174,8 +175,10 @@ pub fn fitted(
             return None;
         }
         let mut samples = Vec::new();
-        for y in top as usize..=bottom as usize {
-            for x in left as usize..=right as usize {
+        for y in (top as usize..=bottom as usize).step_by(every) {
+            // Every other row begins elsewhere, so that no cell of the print is passed over.
+            let shift = if y / every % 2 == 1 { every / 2 } else { 0 };
+            for x in (left as usize + shift..=right as usize).step_by(every) {
                 let q = inverse * (Vector2::new(x as f64, y as f64) - at);
                 if q.amax() < reach
                     && let Some((value, slope)) = patch.at(q.x, q.y)
@@ -253,6 +256,5 @@ pub fn fitted(
         pixel: Pixel { x: at.x, y: at.y },
         sigma_px,
         likeness,
-        square_px: px_per_mm * size * square_mm,
     })
 }

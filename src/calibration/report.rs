@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use crate::calibration::coverage::{self, Coverage};
+use crate::calibration::coverage::{self, Coverage, Lit};
 use crate::calibration::cross_validation::Difference;
 use crate::calibration::lens;
 use crate::calibration::placement::Naming;
@@ -65,6 +65,15 @@ pub struct ViewReport {
     pub outlier: bool,
 }
 
+/// A picture without a board.
+#[derive(Clone, Debug, Serialize)]
+pub struct NotFound {
+    /// File or frame.
+    pub name: String,
+    /// Half a sentence.
+    pub why: String,
+}
+
 /// A corner left out.
 #[derive(Clone, Debug, Serialize)]
 pub struct OutlierCorner {
@@ -95,8 +104,8 @@ pub struct Report {
     pub model: &'static str,
     /// Pictures looked at.
     pub pictures: usize,
-    /// Pictures in which no board was found.
-    pub without_board: Vec<String>,
+    /// Pictures in which no board was found, and why.
+    pub without_board: Vec<NotFound>,
     /// Corners found and used.
     pub corners: usize,
     /// Corners used.
@@ -135,13 +144,15 @@ pub struct Circumstances {
     /// How sure their corners' names are.
     pub namings: Vec<Naming>,
     /// Pictures in which no board was found.
-    pub without_board: Vec<String>,
+    pub without_board: Vec<NotFound>,
+    /// Where light fell in any picture.
+    pub lit: Lit,
 }
 
 impl Report {
     /// Of a calibration.
     pub fn new(calibration: &Calibration, difference: Option<&Difference>, circumstances: &Circumstances) -> Self {
-        let coverage = coverage::coverage(calibration);
+        let coverage = coverage::coverage(calibration, &circumstances.lit);
         let mut warnings = coverage::warnings(calibration, &coverage);
         let mut views: Vec<ViewReport> = (calibration.views.iter().enumerate())
             .map(|(number, view)| view_report(view, &circumstances.names[number], circumstances.namings[number]))
@@ -173,6 +184,14 @@ impl Report {
             warnings.push(format!(
                 "two halves of the views differ by {:.2} px (median): more and better spread views are needed",
                 difference.median_px
+            ));
+        }
+        if circumstances.namings.iter().all(|naming| *naming == Naming::Shifted) {
+            let most = views.iter().map(|view| view.corners).max().unwrap_or(0);
+            warnings.push(format!(
+                "no picture shows just the whole board: {most} corners at most were found; that does no harm to the camera, but check that \
+                 {} counts its columns and rows rightly (of a checkerboard, inner corners)",
+                circumstances.board
             ));
         }
         let covariance = calibration.covariance.as_ref();
@@ -243,7 +262,7 @@ impl Report {
         let c = &self.coverage;
         let _ = writeln!(
             text,
-            "  coverage      {:.0} % of the picture; tilt {:.0}°–{:.0}°; distance {:.0}–{:.0} mm",
+            "  coverage      {:.0} % of the image field; tilt {:.0}°–{:.0}°; distance {:.0}–{:.0} mm",
             c.share * 100.0,
             c.tilt_degrees[0],
             c.tilt_degrees[1],
@@ -294,8 +313,8 @@ impl Report {
         if self.outlier_corners.len() > 8 {
             let _ = writeln!(text, "  … and {} more", self.outlier_corners.len() - 8);
         }
-        for name in &self.without_board {
-            let _ = writeln!(text, "  no board found in {name}");
+        for picture in &self.without_board {
+            let _ = writeln!(text, "  no board found in {}: {}", picture.name, picture.why);
         }
         for warning in &self.warnings {
             let _ = writeln!(text, "  warning: {warning}");

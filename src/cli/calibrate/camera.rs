@@ -6,17 +6,19 @@ use anyhow::Context as _;
 use serde_json::{Value, json};
 
 use crate::calibration::board::BoardLayout;
+use crate::calibration::coverage::Lit;
 use crate::calibration::cross_validation::cross_validated;
-use crate::calibration::detection::{Detection, detect};
+use crate::calibration::detection::{Detection, detect, why_not};
 use crate::calibration::error::{CalibrationError, LEAST_VIEWS};
 use crate::calibration::lens::LensModel;
 use crate::calibration::plot;
 use crate::calibration::refine::{Calibration, View, calibrate};
-use crate::calibration::report::{Circumstances, Report};
+use crate::calibration::report::{Circumstances, NotFound, Report};
 use crate::camera::file;
 use crate::cli::calibrate::pictures::{Seen, look_at_all};
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
+use crate::image::buffer::{Image, Rgb8};
 use crate::media::image_files;
 
 /// Measure intrinsics and lens from pictures of a board.
@@ -82,6 +84,12 @@ impl Model {
     }
 }
 
+/// What came of a picture.
+struct Looked {
+    found: Result<Detection, String>,
+    lit: Lit,
+}
+
 /// Run it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let layout = BoardLayout::new(&args.board, args.square_mm).map_err(|error| UsageError(error.to_string()))?;
@@ -89,24 +97,38 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     for path in [&args.output, &report_path, &plot_path].into_iter().chain(&args.corners_out) {
         context.refuse_overwriting(path)?;
     }
-    let seen = look_at_all(&args.images, args.frames as usize, &context.console, &|image| {
-        detect(image, &layout)
-    })?;
+    let look = |image: &Image<Rgb8>| Looked {
+        found: detect(image, &layout).ok_or_else(|| why_not(image, &layout)),
+        lit: Lit::of(image),
+    };
+    let seen = look_at_all(&args.images, args.frames as usize, &context.console, &look)?;
     let size = same_size(&seen)?;
-    let (with_board, without_board): (Vec<_>, Vec<_>) = seen.iter().partition(|seen| seen.found.is_some());
+    let (with_board, without_board): (Vec<_>, Vec<_>) = seen.iter().partition(|seen| seen.found.found.is_ok());
+    let without_board: Vec<NotFound> = (without_board.iter())
+        .filter_map(|seen| {
+            let why = seen.found.found.as_ref().err()?.clone();
+            let name = seen.name.clone();
+            Some(NotFound { name, why })
+        })
+        .collect();
     if with_board.len() < LEAST_VIEWS {
+        let reasons: Vec<String> = (without_board.iter().take(3))
+            .map(|picture| format!("{}: {}", picture.name, picture.why))
+            .collect();
         return Err(CalibrationError::TooFewViews {
             found: with_board.len(),
             pictures: seen.len(),
             advice: format!(
-                "see that the board is {} (a checkerboard counts inner corners), sharp, evenly lit and not mirrored",
+                "{}{}take more, and see that the board is {} (a checkerboard counts inner corners) and not mirrored",
+                reasons.join("; "),
+                if reasons.is_empty() { "" } else { "; " },
                 args.board
             ),
         }
         .into());
     }
     let found: Vec<(&str, &Detection)> = (with_board.iter())
-        .filter_map(|seen| Some((seen.name.as_str(), seen.found.as_ref()?)))
+        .filter_map(|seen| Some((seen.name.as_str(), seen.found.found.as_ref().ok()?)))
         .collect();
     let dot_radius_mm = median(found.iter().filter_map(|(_, detection)| detection.dot_radius_mm).collect());
     let views: Vec<View> = (found.iter())
@@ -123,7 +145,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         dot_radius_mm,
         names: found.iter().map(|(name, _)| (*name).to_owned()).collect(),
         namings: found.iter().map(|(_, detection)| detection.naming).collect(),
-        without_board: without_board.iter().map(|seen| seen.name.clone()).collect(),
+        without_board,
+        lit: seen.iter().fold(Lit::default(), |lit, seen| lit.or(&seen.found.lit)),
     };
     let report = Report::new(&calibration, difference.as_ref(), &circumstances);
     if let Some(path) = &args.corners_out {
