@@ -204,7 +204,6 @@ fn play(play: &Play) -> Outcome {
             let mut good_line = BadLine::new(Damage::default(), 0);
             for sequence in last..to - 1 {
                 write_all(&mut arm, &ledger.send(&mut good_line, sequence));
-                outcome.at_risk.insert(sequence);
             }
             write_all(&mut arm, &packet(to - 1)[..30]);
             drop(arm);
@@ -215,8 +214,13 @@ fn play(play: &Play) -> Outcome {
         } else {
             last_arm = Some(arm);
         }
-        let intact = ledger.intact().into_iter().map(|(sequence, _)| sequence);
-        outcome.intact.extend(intact.filter(|sequence| *sequence < last));
+        for (sequence, end) in ledger.intact() {
+            if end as u64 <= stretch_bytes {
+                outcome.intact.insert(sequence);
+            } else {
+                outcome.at_risk.insert(sequence);
+            }
+        }
     }
     outcome.statistics = feed.stop();
     drop(last_arm);
