@@ -1,5 +1,6 @@
 //! endofield: endoscope video, clearer than the endoscope saw it, a moment later, always.
 
+pub mod calibration;
 pub mod camera;
 pub mod cli;
 pub mod compose;

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 const FLOORS: &[&[&str]] = &[
     &["geometry", "image", "solver", "time", "progress", "yaml"],
     &["camera", "media", "quality", "robot"],
-    &["frame", "light_field", "recording", "synthetic"],
+    &["calibration", "frame", "light_field", "recording", "synthetic"],
     &["pipeline", "localization"],
     &["sources", "stages", "sinks"],
     &["config"],

@@ -1,5 +1,6 @@
 //! The commands; the only place that prints.
 
+pub mod calibrate;
 pub mod arm;
 pub mod console;
 pub mod context;
@@ -47,6 +48,7 @@ struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Calibrate(calibrate::Args),
     Demo(demo::Args),
     Process(process::Args),
     LightField(light_field::Args),
@@ -112,6 +114,7 @@ fn dispatch(cli: Cli) -> anyhow::Result<Ended> {
 
 fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
     match command {
+        Command::Calibrate(args) => calibrate::run(&args, context),
         Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
         Command::LightField(args) => {

@@ -15,3 +15,7 @@ pub enum RobotBase {}
 /// The arm's last link, where the scope is plugged in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Hand {}
+
+/// A calibration board: x along its first side, y along the other, z away from who looks at it; origin at its first point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Board {}

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder, ImageReader as Decoder};
 
-use crate::image::buffer::Rgb8;
+use crate::image::buffer::{Image, Rgb8};
 use crate::image::pool::Pool;
 use crate::media::color::ColorTags;
 use crate::media::error::MediaError;
@@ -74,7 +74,7 @@ impl NumberedName {
 }
 
 /// The last run of digits in a name without its ending: what numbers `frame_0012.png`.
-fn last_number(name: &str) -> Option<u64> {
+pub fn last_number(name: &str) -> Option<u64> {
     let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
     let end = stem.rfind(|c: char| c.is_ascii_digit())? + 1;
     let start = stem[..end].rfind(|c: char| !c.is_ascii_digit()).map_or(0, |at| at + 1);
@@ -116,6 +116,32 @@ fn decode(path: &Path) -> Result<image::RgbImage, MediaError> {
     let decoder = Decoder::open(path).map_err(|e| refuse(e.to_string()))?;
     let decoder = decoder.with_guessed_format().map_err(|e| refuse(e.to_string()))?;
     Ok(decoder.decode().map_err(|e| refuse(e.to_string()))?.into_rgb8())
+}
+
+/// True for a file that ends like a picture.
+pub fn is_picture(path: &Path) -> bool {
+    path.is_file()
+        && path
+            .extension()
+            .is_some_and(|ending| ENDINGS.contains(&ending.to_string_lossy().to_ascii_lowercase().as_str()))
+}
+
+/// One picture, as 8-bit RGB.
+pub fn read(path: &Path) -> Result<Image<Rgb8>, MediaError> {
+    let picture = decode(path)?;
+    let (width, height) = (picture.width() as usize, picture.height() as usize);
+    let mut image = Image::filled(width, height, [0; 3]);
+    image.as_bytes_mut().copy_from_slice(picture.as_raw());
+    Ok(image)
+}
+
+/// One PNG; an existing file is replaced.
+pub fn write(path: &Path, image: &Image<Rgb8>) -> Result<(), MediaError> {
+    write_png(path, image.as_bytes(), image.size(), ExtendedColorType::Rgb8).map_err(|reason| MediaError::Write {
+        path: path.into(),
+        frames: 0,
+        reason,
+    })
 }
 
 /// Reads pictures one after the other, evenly spaced in time.

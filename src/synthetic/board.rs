@@ -7,16 +7,12 @@ use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
-use crate::geometry::space::Camera;
+use crate::geometry::space::{Board, Camera};
 use crate::geometry::transform::Transform;
 use crate::image::buffer::{Image, Rgb8};
 use crate::synthetic::light::arriving;
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::renderer::{Renderer, soften};
-
-/// The board's own space: x along the longer side, y along the shorter, z away from the camera; origin at the first inner corner.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Board {}
 
 /// Inner corners along x and y.
 pub const CORNERS: [usize; 2] = [9, 6];

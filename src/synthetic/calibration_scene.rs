@@ -6,11 +6,11 @@ use std::path::Path;
 use rayon::prelude::*;
 use serde_json::json;
 
-use crate::geometry::space::{Camera, World};
+use crate::geometry::space::{Board, Camera, World};
 use crate::geometry::transform::Transform;
 use crate::progress::Progress;
 use crate::synthetic::arm::arm_readings;
-use crate::synthetic::board::{Board, CORNERS, SQUARE_MM, corners, picture, station, waved};
+use crate::synthetic::board::{CORNERS, SQUARE_MM, corners, picture, station, waved};
 use crate::synthetic::export::{make_folder, write_arm, write_camera, write_hand_eye, write_poses, write_rgb, write_text};
 use crate::synthetic::noise::hash_u64;
 use crate::synthetic::renderer::Renderer;

@@ -23,6 +23,9 @@ const CUT_SHARE: f32 = 1.0;
 /// … and for more than this, px.
 const LEAST_CUT_PX: f32 = 6.0;
 
+/// Most stretches of so many pixels have nothing to replace.
+const LOOKED_AT_ONCE: usize = 32;
+
 const CHANGED: u8 = 1;
 const MUCH_CHANGED: u8 = 2;
 
@@ -60,9 +63,9 @@ impl CutPatches {
             let [much, cut] = &mut self.counts[run.label as usize];
             for x in (run.begin as usize..run.end as usize).filter(|&x| self.change.at(x, y) == MUCH_CHANGED) {
                 *much += 1;
-                let own = brightness(scene.image.at(x, y));
-                let is_left = |x: usize, y: usize| scene.distance.at(x, y) == 0 && shares.at(x, y) == 0;
-                let goes_on = |x: usize, y: usize| is_left(x, y) && (brightness(scene.image.at(x, y)) - own).abs() < ALIKE_LEVELS;
+                let level = |x: usize, y: usize| brightness(scene.image.at(x, y));
+                let is_left = |u: usize, v: usize| shares.at(u, v) == 0 && scene.distance.at(u, v) == 0;
+                let goes_on = |u: usize, v: usize| is_left(u, v) && (level(u, v) - level(x, y)).abs() < ALIKE_LEVELS;
                 *cut += u32::from(x > 0 && goes_on(x - 1, y))
                     + u32::from(x + 1 < width && goes_on(x + 1, y))
                     + u32::from(y > 0 && goes_on(x, y - 1))
@@ -84,12 +87,18 @@ impl CutPatches {
         let rows = self.change.pixels_mut().par_chunks_mut(width.max(1)).enumerate();
         rows.with_min_len(16).for_each(|(y, change)| {
             change.fill(0);
-            let pixels = shares.row(y).iter().zip(image.row(y)).zip(canvas.color.row(y));
-            for (change, ((&share, &old), &new)) in change.iter_mut().zip(pixels) {
-                if share >= least {
-                    let darker = f32::from(share) * (1.0 / 255.0) * (brightness(old) - brightness(new));
-                    *change =
-                        CHANGED * u8::from(darker > CHANGED_LEVELS) + (MUCH_CHANGED - CHANGED) * u8::from(darker > EDGE_LEVELS);
+            let (old, new) = (image.row(y), canvas.color.row(y));
+            for (first, shares) in (0..).step_by(LOOKED_AT_ONCE).zip(shares.row(y).chunks(LOOKED_AT_ONCE)) {
+                if shares.iter().all(|&share| share < least) {
+                    continue;
+                }
+                for (x, &share) in (first..).zip(shares).filter(|(_, share)| **share >= least) {
+                    let darker = f32::from(share) * (1.0 / 255.0) * (brightness(old[x]) - brightness(new[x]));
+                    change[x] = if darker > EDGE_LEVELS {
+                        MUCH_CHANGED
+                    } else {
+                        CHANGED * u8::from(darker > CHANGED_LEVELS)
+                    };
                 }
             }
         });

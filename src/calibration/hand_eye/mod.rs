@@ -1,0 +1,21 @@
+//! Hand-eye calibration: how the camera sits on the arm's last link, X = `hand_from_camera`, and where the board lies,
+//! Z = `base_from_board`.
+//!
+//! For every station of the arm, base_from_hand · X · camera_from_board = Z. Two stations make Z disappear: A·X = X·B with the
+//! [`motion`]s A = hand_i_from_hand_j and B = camera_i_from_camera_j.
+//!
+//! 1. [`motion`]: motions that tell most are chosen (Schmidt, Vogt and Niemann 2004), and what cannot be told is said;
+//! 2. [`rotation_first`], [`simultaneous`], [`dual_quaternion`], [`robot_world`]: closed forms, all of the literature's;
+//! 3. [`consensus`]: stations that contradict the rest are found;
+//! 4. [`refinement`]: X, Z and whatever else is unknown, where the board is seen again, with priors and covariance.
+
+pub mod consensus;
+pub mod dual_quaternion;
+#[cfg(test)]
+pub mod example;
+pub mod method;
+pub mod motion;
+pub mod refinement;
+pub mod robot_world;
+pub mod rotation_first;
+pub mod simultaneous;

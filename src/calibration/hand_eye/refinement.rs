@@ -1,0 +1,637 @@
+//! X, Z and what else is unknown, where the board is seen again.
+//!
+//! Made least is Σ ρ(‖π(X⁻¹·(Cᵥ·H_v(δ, q))⁻¹·Z·P) − u‖²/σ²) over corners P of views v, with the hand's pose H_v of view v at a time offset δ and
+//! joint offsets q, and a small correction C_v of each. Corrections have a prior whose deviations are found from the data: the mean
+//! squares of what the corrections are and of what they might be besides (expectation–maximization: Dempster, Laird and Rubin 1977),
+//! with heavy tails, so that a view whose hand was somewhere else is heard less (Student's t: Lange, Little and Taylor 1989).
+//!
+//! Pose errors and reprojection errors as objectives are compared by Tabb and Ahmad Yousef 2017 and by Ali et al. 2019; with the arm's
+//! errors as unknowns of their own the reprojection keeps the meaning that its covariance needs.
+
+use std::ops::Range;
+
+use nalgebra::{DMatrix, Matrix6, UnitQuaternion, Vector3, Vector6};
+
+use crate::camera::intrinsics::Pixel;
+use crate::camera::model::CameraModel;
+use crate::geometry::point::Point;
+use crate::geometry::space::{Board, Camera, Hand, RobotBase};
+use crate::geometry::transform::Transform;
+use crate::solver::least_squares::{self, Problem, Solution, minimize};
+use crate::solver::robust_loss::RobustLoss;
+
+/// A corner of the board, and where a view shows it.
+#[derive(Clone, Copy, Debug)]
+pub struct Sighting {
+    /// On the board, mm.
+    pub corner: Point<Board>,
+    /// In the picture, with the lens.
+    pub pixel: Pixel,
+}
+
+/// Where the hand was at each view.
+pub trait HandPoses: Sync {
+    /// The hand at a view, had the arm's stamps `offset_s` added and its joints `offsets` (mm or rad). `None` where the arm does not say.
+    fn base_from_hand(&self, view: usize, offset_s: f64, offsets: &[f64]) -> Option<Transform<RobotBase, Hand>>;
+
+    /// Joints whose offsets can be found; 0 for an arm that tells poses only.
+    fn joints(&self) -> usize {
+        0
+    }
+}
+
+impl HandPoses for Vec<Transform<RobotBase, Hand>> {
+    fn base_from_hand(&self, view: usize, _: f64, _: &[f64]) -> Option<Transform<RobotBase, Hand>> {
+        self.get(view).copied()
+    }
+}
+
+/// What is sought besides X and Z, and what is known of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// Whether the arm's clock may differ from the camera's.
+    pub time_offset: bool,
+    /// Prior deviation of each joint's offset (mm or rad); none: joints are right.
+    pub joint_sigma: Vec<f64>,
+    /// First guess of the hand's deviation, mm.
+    pub place_sigma_mm: f64,
+    /// First guess of the hand's deviation, rad.
+    pub turn_sigma_rad: f64,
+    /// First guess of a corner's deviation along an axis, px.
+    pub pixel_sigma: f64,
+    /// Rounds of finding the deviations; with none the guesses hold.
+    pub rounds: usize,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            time_offset: false,
+            joint_sigma: Vec::new(),
+            place_sigma_mm: 0.5,
+            turn_sigma_rad: 0.003,
+            pixel_sigma: 0.3,
+            rounds: 25,
+        }
+    }
+}
+
+/// Degrees of freedom of Student's t: few enough that a wrong view is let go, enough that right ones count nearly in full.
+const TAIL: f64 = 5.0;
+/// The deviations found no longer move by more than this share.
+const SETTLED: f64 = 0.01;
+/// Deviations never fall below these, mm, rad, px: with exact data the corrections would have no room for rounding.
+const LEAST_SIGMAS: [f64; 3] = [1e-4, 1e-6, 1e-4];
+/// A corner's residual counts in full up to so many deviations.
+const HUBER: f64 = 2.5;
+
+/// The answer, with its errors.
+#[derive(Clone, Debug)]
+pub struct Refined {
+    /// X.
+    pub hand_from_camera: Transform<Hand, Camera>,
+    /// Of X: a shift of the camera's centre in the hand's space (mm), then a rotation vector in the hand's space (rad).
+    pub covariance: Matrix6<f64>,
+    /// Z.
+    pub base_from_board: Transform<RobotBase, Board>,
+    /// Of Z, likewise in the base's space.
+    pub board_covariance: Matrix6<f64>,
+    /// To be added to the arm's stamps, s, and its deviation; zero if not sought.
+    pub time_offset_s: [f64; 2],
+    /// Per joint: offset to be added to its reading, and its deviation, mm or rad.
+    pub joint_offsets: Vec<[f64; 2]>,
+    /// Per view, what was wrong with the hand: shift (mm) and rotation vector (rad) in the base's space.
+    pub corrections: Vec<Vector6<f64>>,
+    /// Per view, how far it is trusted: about 1 for one like the others, near 0 for one whose hand was elsewhere.
+    pub trust: Vec<f64>,
+    /// Deviations found: hand's place along an axis (mm), rotation about an axis (rad), corner along an axis (px).
+    pub sigmas: [f64; 3],
+    /// Root mean square of the residual vectors with the corrections, px.
+    pub rms_px: f64,
+    /// Per view, the same without them: what the arm alone predicts, px.
+    pub predicted_px: Vec<f64>,
+}
+
+/// Refine from a first answer. `None` where a corner cannot be seen from there, or the views do not determine the answer.
+pub fn refine(
+    views: &[Vec<Sighting>],
+    hands: &dyn HandPoses,
+    camera: &CameraModel,
+    (hand_from_camera, base_from_board): (Transform<Hand, Camera>, Transform<RobotBase, Board>),
+    settings: &Settings,
+) -> Option<Refined> {
+    let mut first = vec![0];
+    for view in views {
+        first.push(first.last()? + 2 * view.len());
+    }
+    let joints = hands.joints().min(settings.joint_sigma.len());
+    let mut state = State {
+        hand_from_camera,
+        base_from_board,
+        time_offset_s: 0.0,
+        joints: vec![0.0; joints],
+        corrections: vec![Vector6::zeros(); views.len()],
+    };
+    let mut view_problem = Reprojection {
+        views,
+        hands,
+        camera,
+        first: &first,
+        joint_sigma: &settings.joint_sigma[..joints],
+        time_offset: settings.time_offset,
+        sigmas: [settings.place_sigma_mm, settings.turn_sigma_rad, settings.pixel_sigma],
+        trust: vec![1.0; views.len()],
+    };
+    let search = least_squares::Settings {
+        least_gain: 1e-10,
+        ..least_squares::Settings::default()
+    };
+    let mut solution = minimize(&view_problem, state, &search)?;
+    for _ in 0..settings.rounds {
+        let before = view_problem.sigmas;
+        view_problem.learn_deviations(&solution)?;
+        state = solution.state.clone();
+        solution = minimize(&view_problem, state, &search)?;
+        let moved = before.iter().zip(&view_problem.sigmas).map(|(a, b)| (a / b).ln().abs());
+        if moved.fold(0.0, f64::max) < SETTLED {
+            break;
+        }
+    }
+    view_problem.answer(solution)
+}
+
+#[derive(Clone, Debug)]
+struct State {
+    hand_from_camera: Transform<Hand, Camera>,
+    base_from_board: Transform<RobotBase, Board>,
+    time_offset_s: f64,
+    joints: Vec<f64>,
+    corrections: Vec<Vector6<f64>>,
+}
+
+struct Reprojection<'a> {
+    views: &'a [Vec<Sighting>],
+    hands: &'a dyn HandPoses,
+    camera: &'a CameraModel,
+    /// First residual of each view, and one past the last.
+    first: &'a [usize],
+    joint_sigma: &'a [f64],
+    time_offset: bool,
+    /// Place mm, turn rad, corner px.
+    sigmas: [f64; 3],
+    trust: Vec<f64>,
+}
+
+/// Directions of X and Z.
+const POSES: usize = 12;
+
+impl Reprojection<'_> {
+    /// Directions before the corrections: X, Z, time, joints.
+    fn common(&self) -> usize {
+        POSES + usize::from(self.time_offset) + self.joint_sigma.len()
+    }
+
+    fn hand(&self, state: &State, view: usize) -> Option<Transform<RobotBase, Hand>> {
+        let told = self.hands.base_from_hand(view, state.time_offset_s, &state.joints)?;
+        Some(shifted(&told, state.corrections[view].as_slice()))
+    }
+
+    /// Where a view shows a corner from a hand's pose, minus where it was seen, px.
+    fn residual(&self, state: &State, base_from_hand: &Transform<RobotBase, Hand>, sighting: &Sighting) -> Option<[f64; 2]> {
+        let camera_from_board = (*base_from_hand * state.hand_from_camera).inverse() * state.base_from_board;
+        let pixel = self.camera.project(camera_from_board * sighting.corner)?;
+        Some([pixel.x - sighting.pixel.x, pixel.y - sighting.pixel.y])
+    }
+
+    /// Deviations and trust from what the corrections turned out to be.
+    fn learn_deviations(&mut self, solution: &Solution<State>) -> Option<()> {
+        let covariance = solution.covariance.as_ref()?;
+        let common = self.common();
+        let [place, turn, pixel] = self.sigmas;
+        let (mut squares, mut trusts) = ([0.0; 2], 0.0);
+        for (view, correction) in solution.state.corrections.iter().enumerate() {
+            // What it is, and what it might be besides.
+            let square =
+                |axis: usize| correction[axis].powi(2) + covariance[(common + 6 * view + axis, common + 6 * view + axis)];
+            let places: f64 = (0..3).map(square).sum();
+            let turns: f64 = (3..6).map(square).sum();
+            let trust = (TAIL + 6.0) / (TAIL + places / place.powi(2) + turns / turn.powi(2));
+            self.trust[view] = trust;
+            squares[0] += trust * places;
+            squares[1] += trust * turns;
+            trusts += 1.0;
+        }
+        let measured = self.measured();
+        // A corner within Huber's width counts in full; the residuals of Gaussian noise lose as many squares as there are unknowns.
+        let rest: f64 = (solution.residuals.rows(0, measured).iter().enumerate())
+            .map(|(row, r)| solution.weights[row / 2] * r * r)
+            .sum();
+        let heard = 2.0 * solution.weights.iter().sum::<f64>();
+        let held: f64 = (0..self.views.len() * 6)
+            .map(|i| {
+                let (view, axis) = (i / 6, i % 6);
+                let sigma = if axis < 3 { place } else { turn };
+                self.trust[view] * covariance[(common + i, common + i)] / sigma.powi(2)
+            })
+            .sum();
+        // Of the corrections only as many are the picture's as the prior does not hold.
+        let unknowns = common as f64 + (6 * self.views.len()) as f64 - held;
+        let free = (heard - unknowns).max(1.0);
+        let new = [
+            (squares[0] / (3.0 * trusts)).sqrt(),
+            (squares[1] / (3.0 * trusts)).sqrt(),
+            pixel * (rest / free).sqrt(),
+        ];
+        for ((sigma, new), least) in self.sigmas.iter_mut().zip(new).zip(LEAST_SIGMAS) {
+            *sigma = new.max(least);
+        }
+        Some(())
+    }
+
+    fn answer(&self, solution: Solution<State>) -> Option<Refined> {
+        let covariance = solution.covariance.as_ref()?;
+        let state = &solution.state;
+        let six = |at: usize| -> Matrix6<f64> { covariance.fixed_view::<6, 6>(at, at).into_owned() };
+        let deviation = |at: usize, covariance: &DMatrix<f64>| covariance[(at, at)].sqrt();
+        let first_joint = POSES + usize::from(self.time_offset);
+        let joint_offsets =
+            (state.joints.iter().enumerate()).map(|(joint, &offset)| [offset, deviation(first_joint + joint, covariance)]);
+        let measured = self.measured();
+        let pixels: f64 = solution.residuals.rows(0, measured).norm_squared() * self.sigmas[2].powi(2);
+        let without = State {
+            corrections: vec![Vector6::zeros(); self.views.len()],
+            ..state.clone()
+        };
+        Some(Refined {
+            hand_from_camera: state.hand_from_camera,
+            covariance: six(0),
+            base_from_board: state.base_from_board,
+            board_covariance: six(6),
+            time_offset_s: if self.time_offset {
+                [state.time_offset_s, deviation(POSES, covariance)]
+            } else {
+                [0.0; 2]
+            },
+            joint_offsets: joint_offsets.collect(),
+            corrections: state.corrections.clone(),
+            trust: self.trust.clone(),
+            sigmas: self.sigmas,
+            rms_px: (pixels / (measured / 2) as f64).sqrt(),
+            predicted_px: (0..self.views.len()).map(|view| self.rms_of(&without, view)).collect(),
+        })
+    }
+
+    /// Root mean square of a view's residual vectors, px.
+    fn rms_of(&self, state: &State, view: usize) -> f64 {
+        let Some(hand) = self.hand(state, view) else {
+            return f64::NAN;
+        };
+        let squares = (self.views[view].iter())
+            .map(|sighting| (self.residual(state, &hand, sighting)).map_or(f64::NAN, |[x, y]| x * x + y * y));
+        (squares.sum::<f64>() / self.views[view].len() as f64).sqrt()
+    }
+}
+
+impl Problem for Reprojection<'_> {
+    type State = State;
+
+    fn directions(&self) -> usize {
+        self.common() + 6 * self.views.len()
+    }
+
+    fn measured(&self) -> usize {
+        self.first[self.views.len()]
+    }
+
+    fn priors(&self) -> usize {
+        6 * self.views.len() + self.joint_sigma.len()
+    }
+
+    fn loss(&self) -> RobustLoss {
+        RobustLoss::Huber { width: HUBER }
+    }
+
+    fn residuals(&self, state: &State, rows: Range<usize>, out: &mut [f64]) {
+        let measured = self.measured();
+        let mut row = rows.start;
+        while row < rows.end.min(measured) {
+            let view = self.first.partition_point(|&first| first <= row) - 1;
+            let hand = self.hand(state, view);
+            let end = self.first[view + 1].min(rows.end);
+            while row < end {
+                let sighting = &self.views[view][(row - self.first[view]) / 2];
+                let residual = hand
+                    .and_then(|hand| self.residual(state, &hand, sighting))
+                    .unwrap_or([f64::NAN; 2]);
+                // Blocks are asked for whole.
+                out[row - rows.start] = residual[0] / self.sigmas[2];
+                out[row + 1 - rows.start] = residual[1] / self.sigmas[2];
+                row += 2;
+            }
+        }
+        for row in row..rows.end {
+            let prior = row - measured;
+            out[row - rows.start] = match prior.checked_sub(6 * self.views.len()) {
+                Some(joint) => state.joints[joint] / self.joint_sigma[joint],
+                None => {
+                    let (view, axis) = (prior / 6, prior % 6);
+                    let sigma = self.sigmas[usize::from(axis >= 3)];
+                    self.trust[view].sqrt() * state.corrections[view][axis] / sigma
+                }
+            };
+        }
+    }
+
+    fn moved(&self, state: &State, step: &[f64]) -> State {
+        let common = self.common();
+        let first_joint = POSES + usize::from(self.time_offset);
+        State {
+            hand_from_camera: shifted(&state.hand_from_camera, &step[..6]),
+            base_from_board: shifted(&state.base_from_board, &step[6..POSES]),
+            time_offset_s: state.time_offset_s + if self.time_offset { step[POSES] } else { 0.0 },
+            joints: state
+                .joints
+                .iter()
+                .zip(&step[first_joint..])
+                .map(|(joint, step)| joint + step)
+                .collect(),
+            corrections: (state.corrections.iter().zip(step[common..].chunks(6)))
+                .map(|(correction, step)| correction + Vector6::from_column_slice(step))
+                .collect(),
+        }
+    }
+
+    fn support(&self, direction: usize) -> Vec<Range<usize>> {
+        let (measured, common) = (self.measured(), self.common());
+        let own = |prior: usize| measured + prior..measured + prior + 1;
+        match direction.checked_sub(common) {
+            Some(correction) => {
+                let view = correction / 6;
+                vec![self.first[view]..self.first[view + 1], own(correction)]
+            }
+            None => match direction.checked_sub(POSES + usize::from(self.time_offset)) {
+                Some(joint) => vec![0..measured, own(6 * self.views.len() + joint)],
+                None => vec![0..measured],
+            },
+        }
+    }
+
+    fn small_step(&self, direction: usize) -> f64 {
+        // Samples of the arm lie milliseconds apart.
+        if self.time_offset && direction == POSES { 1e-4 } else { 1e-5 }
+    }
+}
+
+/// A pose whose origin is moved by the first three numbers (mm), and that is turned about it by the rotation vector of the others (rad),
+/// both in the space it leads to.
+fn shifted<To, From>(pose: &Transform<To, From>, by: &[f64]) -> Transform<To, From> {
+    let turn = UnitQuaternion::from_scaled_axis(Vector3::new(by[3], by[4], by[5]));
+    Transform::new(turn * pose.rotation(), pose.translation() + Vector3::new(by[0], by[1], by[2]))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::DVector;
+    use rand::{RngExt as _, SeedableRng as _};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::StandardNormal;
+
+    use super::*;
+    use crate::calibration::hand_eye::example::{Example, Noise};
+    use crate::calibration::hand_eye::method::Method;
+    use crate::calibration::hand_eye::motion::Station;
+    use crate::calibration::hand_eye::robot_world::board_of;
+    use crate::camera::distortion::Distortion;
+    use crate::camera::intrinsics::Intrinsics;
+    use crate::robot::kinematics::{Arm, JointKind};
+
+    const PIXEL_SIGMA: f64 = 0.1;
+
+    fn camera() -> CameraModel {
+        CameraModel {
+            width: 960,
+            height: 540,
+            intrinsics: Intrinsics {
+                fx: 800.0,
+                fy: 800.0,
+                cx: 480.0,
+                cy: 270.0,
+            },
+            distortion: Distortion::None,
+        }
+    }
+
+    struct Recorded {
+        example: Example,
+        views: Vec<Vec<Sighting>>,
+        hands: Vec<Transform<RobotBase, Hand>>,
+    }
+
+    /// Corners of a small board with noise, and hands whose joints were off by so much (0.1 mm in the slide), seen through the arm's
+    /// Jacobian at random postures.
+    fn recorded(seed: u64, count: usize, joint_rad: f64) -> Recorded {
+        let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5EED);
+        let example = Example::new(seed, count, Noise::NONE);
+        let arm = Arm::aesop_3000().unwrap();
+        let mut views = Vec::new();
+        let mut hands = Vec::new();
+        for station in &example.stations {
+            let corners = (0..20).map(|i| Point::new(f64::from(i % 5) * 8.0, f64::from(i / 5) * 8.0, 0.0));
+            let sightings = corners.map(|corner| {
+                let pixel = camera().project(station.camera_from_board * corner).unwrap();
+                let mut noise = || PIXEL_SIGMA * random.sample::<f64, _>(StandardNormal);
+                let pixel = Pixel {
+                    x: pixel.x + noise(),
+                    y: pixel.y + noise(),
+                };
+                Sighting { corner, pixel }
+            });
+            views.push(sightings.collect());
+            let posture: Vec<f64> = (arm.joints().iter())
+                .map(|joint| joint.limits[0] + random.random::<f64>() * (joint.limits[1] - joint.limits[0]))
+                .collect();
+            let off = DVector::from_iterator(
+                posture.len(),
+                arm.joints().iter().map(|joint| {
+                    let sigma = if joint.kind == JointKind::Prismatic && joint_rad > 0.0 {
+                        0.1
+                    } else {
+                        joint_rad
+                    };
+                    sigma * random.sample::<f64, _>(StandardNormal)
+                }),
+            );
+            let twist = arm.jacobian(&posture).unwrap() * off;
+            hands.push(shifted(&station.base_from_hand, twist.as_slice()));
+        }
+        Recorded { example, views, hands }
+    }
+
+    impl Recorded {
+        fn start(&self) -> (Transform<Hand, Camera>, Transform<RobotBase, Board>) {
+            let stations: Vec<Station> = (self.example.stations.iter().zip(&self.hands))
+                .map(|(station, &base_from_hand)| Station {
+                    base_from_hand,
+                    ..*station
+                })
+                .collect();
+            let hand_from_camera = Method::Park.solve(&stations).unwrap();
+            (hand_from_camera, board_of(&stations, &hand_from_camera).unwrap())
+        }
+
+        fn refined(&self, settings: &Settings) -> Refined {
+            refine(&self.views, &self.hands, &camera(), self.start(), settings).unwrap()
+        }
+
+        /// The truth minus the answer, in the directions of the covariance.
+        fn error(&self, refined: &Refined) -> Vector6<f64> {
+            let (truth, found) = (self.example.hand_from_camera, refined.hand_from_camera);
+            let turn = (truth.rotation() * found.rotation().inverse()).scaled_axis();
+            let shift = truth.translation() - found.translation();
+            Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
+        }
+    }
+
+    #[test]
+    fn with_an_exact_arm_only_the_corners_noise_is_left() {
+        for seed in 0..5 {
+            let recorded = recorded(seed, 20, 0.0);
+            let refined = recorded.refined(&Settings::default());
+            let [mm, rad] = recorded.example.error_of(&refined.hand_from_camera);
+            assert!(mm < 0.05 && rad.to_degrees() < 0.02, "{seed}: {mm} mm, {}°", rad.to_degrees());
+            assert!(
+                (refined.rms_px / (PIXEL_SIGMA * 2.0_f64.sqrt()) - 1.0).abs() < 0.15,
+                "{}",
+                refined.rms_px
+            );
+            let error = recorded.error(&refined);
+            assert!(
+                (0..6).all(|i| error[i].abs() < 4.5 * refined.covariance[(i, i)].sqrt()),
+                "{error} {}",
+                refined.covariance
+            );
+        }
+    }
+
+    #[test]
+    fn with_noisy_joints_the_truth_lies_within_three_stated_deviations() {
+        let runs = 40;
+        let (mut inside, mut square) = (0, 0.0);
+        for seed in 0..runs {
+            let recorded = recorded(100 + seed, 20, 0.05_f64.to_radians());
+            let refined = recorded.refined(&Settings::default());
+            let [mm, rad] = recorded.example.error_of(&refined.hand_from_camera);
+            assert!(mm < 1.0 && rad.to_degrees() < 0.2, "{seed}: {mm} mm, {}°", rad.to_degrees());
+            let error = recorded.error(&refined);
+            inside += u32::from((0..6).all(|i| error[i].abs() < 3.0 * refined.covariance[(i, i)].sqrt()));
+            square += error.dot(&(refined.covariance.try_inverse().unwrap() * error));
+        }
+        // χ² of six degrees: its mean over the runs is 6 ± 4·√(12/runs).
+        let mean = square / runs as f64;
+        assert!((mean - 6.0).abs() < 4.0 * (12.0 / runs as f64).sqrt(), "{mean}");
+        assert!(f64::from(inside) >= 0.95 * runs as f64, "{inside} of {runs}");
+    }
+
+    #[test]
+    fn a_view_whose_hand_was_elsewhere_is_found_and_let_go() {
+        let mut recorded = recorded(7, 12, 0.02_f64.to_radians());
+        let right = recorded.refined(&Settings::default());
+        recorded.hands[4] = shifted(&recorded.hands[4], &[4.0, -3.0, 2.0, 0.02, 0.0, -0.015]);
+        let refined = recorded.refined(&Settings::default());
+        assert!(
+            (0..12).all(|view| (refined.trust[view] < 0.15) == (view == 4)),
+            "{:?}",
+            refined.trust
+        );
+        let moved = (refined.hand_from_camera.translation() - right.hand_from_camera.translation()).norm();
+        assert!(
+            moved < 3.0 * right.covariance.fixed_view::<3, 3>(0, 0).trace().sqrt(),
+            "{moved} mm"
+        );
+    }
+
+    #[test]
+    fn offsets_of_joints_and_of_the_clock_are_found() {
+        /// A hand whose place depends on a joint and on time, both read wrongly.
+        struct Moving {
+            told: Vec<Transform<RobotBase, Hand>>,
+            velocity: Vec<Vector3<f64>>,
+        }
+        impl HandPoses for Moving {
+            fn base_from_hand(&self, view: usize, offset_s: f64, offsets: &[f64]) -> Option<Transform<RobotBase, Hand>> {
+                // A pose told for time t belongs to t + offset: at the picture's time the hand was where it is told offset earlier.
+                let moved = self.velocity[view] * -offset_s;
+                // The first joint turns the base, the second lifts along z.
+                let turned = Transform::<RobotBase, RobotBase>::new(
+                    UnitQuaternion::from_scaled_axis(Vector3::z() * 0.0),
+                    Vector3::z() * offsets[1] * (view as f64 * 0.9).sin(),
+                );
+                let rolled = self.told[view].perturbed_right(&Vector6::new(
+                    0.0,
+                    0.0,
+                    0.0,
+                    0.0,
+                    offsets[0] * (1.0 + (view as f64).cos()),
+                    0.0,
+                ));
+                Some(shifted(&(turned * rolled), &[moved.x, moved.y, moved.z, 0.0, 0.0, 0.0]))
+            }
+            fn joints(&self) -> usize {
+                2
+            }
+        }
+        let recorded = recorded(9, 24, 0.0);
+        let mut random = ChaCha8Rng::seed_from_u64(3);
+        let moving = Moving {
+            told: recorded.hands.clone(),
+            velocity: (0..24)
+                .map(|_| Vector3::from_fn(|_, _| 20.0 * random.sample::<f64, _>(StandardNormal)))
+                .collect(),
+        };
+        // What it tells if its clock and joints are wrong the other way.
+        let (offset_s, offsets) = (0.040, [0.004, -0.8]);
+        let wrong = Moving {
+            told: (0..24)
+                .map(|view| {
+                    let right = recorded.hands[view];
+                    let moved = moving.velocity[view] * offset_s;
+                    let unrolled = shifted(
+                        &right,
+                        &[
+                            moved.x,
+                            moved.y,
+                            moved.z - offsets[1] * (view as f64 * 0.9).sin(),
+                            0.0,
+                            0.0,
+                            0.0,
+                        ],
+                    );
+                    unrolled.perturbed_right(&Vector6::new(
+                        0.0,
+                        0.0,
+                        0.0,
+                        0.0,
+                        -offsets[0] * (1.0 + (view as f64).cos()),
+                        0.0,
+                    ))
+                })
+                .collect(),
+            velocity: moving.velocity,
+        };
+        let settings = Settings {
+            time_offset: true,
+            joint_sigma: vec![0.01, 1.0],
+            ..Settings::default()
+        };
+        let refined = refine(&recorded.views, &wrong, &camera(), recorded.start(), &settings).unwrap();
+        let [found, sigma] = refined.time_offset_s;
+        assert!((found - offset_s).abs() < (4.0 * sigma).min(0.002), "{found} ± {sigma}");
+        for (joint, offset) in offsets.iter().enumerate() {
+            let [found, sigma] = refined.joint_offsets[joint];
+            assert!(
+                (found - offset).abs() < 4.0 * sigma && sigma < 0.2 * offset.abs(),
+                "{joint}: {found} ± {sigma}"
+            );
+        }
+    }
+}
