@@ -1,7 +1,7 @@
 //! The commands; the only place that prints.
 
-pub mod calibrate;
 pub mod arm;
+pub mod calibrate;
 pub mod console;
 pub mod context;
 pub mod demo;

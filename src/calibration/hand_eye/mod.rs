@@ -7,8 +7,10 @@
 //! 1. [`motion`]: motions that tell most are chosen (Schmidt, Vogt and Niemann 2004), and what cannot be told is said;
 //! 2. [`rotation_first`], [`simultaneous`], [`dual_quaternion`], [`robot_world`]: closed forms, all of the literature's;
 //! 3. [`consensus`]: stations that contradict the rest are found;
-//! 4. [`refinement`]: X, Z and whatever else is unknown, where the board is seen again, with priors and covariance.
+//! 4. [`refinement`]: X, Z and whatever else is unknown, where the board is seen again, with priors and covariance;
+//! 5. [`calibrate`]: all of it, and tried on views left out.
 
+pub mod calibrate;
 pub mod consensus;
 pub mod dual_quaternion;
 #[cfg(test)]

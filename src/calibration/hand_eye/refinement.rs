@@ -182,6 +182,8 @@ struct Reprojection<'a> {
     trust: Vec<f64>,
 }
 
+/// What is known of a time offset before, so that stations at rest do not leave it undetermined, s.
+const TIME_OFFSET_SIGMA_S: f64 = 0.2;
 /// Directions of X and Z.
 const POSES: usize = 12;
 
@@ -304,7 +306,7 @@ impl Problem for Reprojection<'_> {
     }
 
     fn priors(&self) -> usize {
-        6 * self.views.len() + self.joint_sigma.len()
+        6 * self.views.len() + self.joint_sigma.len() + usize::from(self.time_offset)
     }
 
     fn loss(&self) -> RobustLoss {
@@ -332,7 +334,8 @@ impl Problem for Reprojection<'_> {
         for row in row..rows.end {
             let prior = row - measured;
             out[row - rows.start] = match prior.checked_sub(6 * self.views.len()) {
-                Some(joint) => state.joints[joint] / self.joint_sigma[joint],
+                Some(joint) if joint < self.joint_sigma.len() => state.joints[joint] / self.joint_sigma[joint],
+                Some(_) => state.time_offset_s / TIME_OFFSET_SIGMA_S,
                 None => {
                     let (view, axis) = (prior / 6, prior % 6);
                     let sigma = self.sigmas[usize::from(axis >= 3)];
@@ -371,6 +374,9 @@ impl Problem for Reprojection<'_> {
             }
             None => match direction.checked_sub(POSES + usize::from(self.time_offset)) {
                 Some(joint) => vec![0..measured, own(6 * self.views.len() + joint)],
+                None if direction == POSES && self.time_offset => {
+                    vec![0..measured, own(6 * self.views.len() + self.joint_sigma.len())]
+                }
                 None => vec![0..measured],
             },
         }

@@ -104,13 +104,7 @@ pub fn estimate(motions: &[TimedMotion], arm: &PoseBuffer, about: Span, range: S
     best.map_or(shortest, Ok)
 }
 
-fn estimate_over(
-    window_s: f64,
-    motions: &[TimedMotion],
-    arm: &Path,
-    about: Span,
-    range: Span,
-) -> Result<Offset, OffsetError> {
+fn estimate_over(window_s: f64, motions: &[TimedMotion], arm: &Path, about: Span, range: Span) -> Result<Offset, OffsetError> {
     let all = windows(motions, window_s);
     let (center_ms, range_ms) = (about.milliseconds(), range.milliseconds());
     let steps = (range_ms / COARSE_MS).ceil() as i32;

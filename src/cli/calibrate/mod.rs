@@ -1,15 +1,24 @@
 //! `calibrate`: what must be known of camera, arm and color before the light field can be trusted.
 
 pub mod camera;
+pub mod hand_eye;
 pub mod pictures;
+pub mod time_offset;
 
+use std::path::{Path, PathBuf};
+
+use anyhow::Context as _;
 use clap::Subcommand;
 
 use crate::cli::context::{Context, Ended};
 
-/// Measure the camera from pictures of a board.
+/// Measure camera, arm and clocks.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  endofield calibrate camera pictures/ --board checkerboard:9x6 --square-mm 4 -o camera.yaml")]
+#[command(
+    after_help = "Examples:\n  endofield calibrate camera pictures/ --board checkerboard:9x6 --square-mm 4 -o camera.yaml
+  endofield calibrate hand-eye stations/ --camera camera.yaml --board checkerboard:9x6 --square-mm 4
+  endofield calibrate time-offset survey/"
+)]
 pub struct Args {
     #[command(subcommand)]
     subject: Subject,
@@ -18,11 +27,28 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 enum Subject {
     Camera(camera::Args),
+    HandEye(hand_eye::Args),
+    TimeOffset(time_offset::Args),
 }
 
 /// Run it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     match &args.subject {
         Subject::Camera(args) => camera::run(args, context),
+        Subject::HandEye(args) => hand_eye::run(args, context),
+        Subject::TimeOffset(args) => time_offset::run(args, context),
     }
+}
+
+/// `camera.yaml` → `camera_report.json`.
+fn beside(output: &Path, ending: &str) -> PathBuf {
+    let stem = output
+        .file_stem()
+        .map_or_else(|| "result".into(), |stem| stem.to_string_lossy());
+    output.with_file_name(format!("{stem}{ending}"))
+}
+
+fn write_json(path: &Path, value: &serde_json::Value) -> anyhow::Result<()> {
+    std::fs::write(path, format!("{value:#}\n"))
+        .with_context(|| format!("{}: cannot be written; check folder, rights and space", path.display()))
 }
