@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crossbeam::channel::bounded;
+use endofield::robot::feed::driver::{Driver, DriverCounts, Joined};
 use endofield::robot::feed::faults::{BadLine, Damage};
 use endofield::robot::feed::line::LineSource;
 use endofield::robot::feed::message::{DeviceTime, JointValues, Message, Reading, Sample};
@@ -52,35 +53,51 @@ fn packet(sequence: u32) -> Vec<u8> {
     packet
 }
 
-/// Damaged packets one after another, and which of them are still in there, byte for byte: (sequence, position behind it).
-fn damaged(line: &mut BadLine, sequences: std::ops::Range<u32>) -> (Vec<u8>, Vec<(u32, usize)>) {
-    let (mut stream, mut spans) = (Vec::new(), Vec::new());
-    for sequence in sequences {
-        let packet = packet(sequence);
-        let start = stream.len();
-        stream.extend(line.pass(&packet));
-        spans.push((sequence, packet, start, stream.len()));
+/// What went over the line, and which packets are still in there, byte for byte.
+#[derive(Default)]
+struct Ledger {
+    stream: Vec<u8>,
+    spans: Vec<(u32, std::ops::Range<usize>)>,
+}
+
+impl Ledger {
+    /// Send a packet over a bad line; what came out of it.
+    fn send(&mut self, line: &mut BadLine, sequence: u32) -> Vec<u8> {
+        let bytes = line.pass(&packet(sequence));
+        let start = self.stream.len();
+        self.stream.extend_from_slice(&bytes);
+        self.spans.push((sequence, start..self.stream.len()));
+        bytes
     }
-    let mut intact = Vec::new();
-    for (sequence, packet, start, end) in spans {
-        // What was lost at an edge may be made up for by a neighbour's byte.
-        let from = start.saturating_sub(4);
-        let to = (end + 4).min(stream.len());
-        if let Some(at) = stream[from..to].windows(packet.len()).position(|window| window == packet) {
-            intact.push((sequence, from + at + packet.len()));
+
+    /// Sequence number of every packet that came through, and the position behind it. What was lost at an edge may be made up for by a
+    /// neighbour's byte that happens to be the same: then the packet is there all the same.
+    fn intact(&self) -> Vec<(u32, usize)> {
+        let mut intact = Vec::new();
+        for (sequence, span) in &self.spans {
+            let packet = packet(*sequence);
+            let from = span.start.saturating_sub(4);
+            let near = &self.stream[from..(span.end + 4).min(self.stream.len())];
+            if let Some(at) = near.windows(packet.len()).position(|window| window == packet) {
+                intact.push((*sequence, from + at + packet.len()));
+            }
         }
+        intact
     }
-    (stream, intact)
 }
 
 /// Every unharmed packet is delivered with its last byte, whatever came before it: recovery takes no packet at all.
 #[test]
 fn an_unharmed_packet_is_delivered_with_its_last_byte() {
-    let (stream, intact) = damaged(&mut BadLine::new(DAMAGE, 11), 0..60_000);
+    let (mut ledger, mut line) = (Ledger::default(), BadLine::new(DAMAGE, 11));
+    for sequence in 0..60_000 {
+        ledger.send(&mut line, sequence);
+    }
+    let intact = ledger.intact();
     assert!((10_000..20_000).contains(&intact.len()), "{}", intact.len());
     let mut parser = Parser::default();
     let mut delivered = Vec::new();
-    for (position, byte) in (1..).zip(&stream) {
+    for (position, byte) in (1..).zip(&ledger.stream) {
         parser.take(&[*byte], |packet| {
             delivered.push((decode(packet).unwrap().sequence.unwrap(), position))
         });
@@ -163,21 +180,16 @@ fn play(play: &Play) -> Outcome {
         let (from, to) = (bound(stretch), bound(stretch + 1));
         // The last ones are for the pull.
         let last = to - if stretch < play.pulls { 6 } else { 0 };
-        let step = if play.rate_hz.is_some() { 1 } else { 64 };
-        let (mut sent, mut stretch_bytes) = (from, 0_u64);
-        // Pieces are damaged apart, so an edge between two is never crossed by a match.
-        while sent < last {
-            let (bytes, intact) = damaged(&mut line, sent..(sent + step).min(last));
+        let mut ledger = Ledger::default();
+        for sequence in from..last {
             if let Some(rate) = play.rate_hz {
-                let due = started + Span::from_seconds(f64::from(sent) / rate);
+                let due = started + Span::from_seconds(f64::from(sequence) / rate);
                 let left = (due - MonotonicClock.now()).0.max(0).unsigned_abs();
                 std::thread::sleep(Duration::from_nanos(left));
             }
-            write_all(&mut arm, &bytes);
-            stretch_bytes += bytes.len() as u64;
-            outcome.intact.extend(intact.iter().map(|(sequence, _)| sequence));
-            sent = (sent + step).min(last);
+            write_all(&mut arm, &ledger.send(&mut line, sequence));
         }
+        let stretch_bytes = ledger.stream.len() as u64;
         sent_bytes += stretch_bytes;
         wait_for("the reader to drain the line", || {
             feed.status().statistics.bytes == heard_before + stretch_bytes
@@ -189,9 +201,9 @@ fn play(play: &Play) -> Outcome {
             outcome.silence_noticed_ms = outcome.silence_noticed_ms.max(noticed.milliseconds());
         }
         if stretch < play.pulls {
+            let mut good_line = BadLine::new(Damage::default(), 0);
             for sequence in last..to - 1 {
-                write_all(&mut arm, &packet(sequence));
-                outcome.at_risk.insert(sequence);
+                write_all(&mut arm, &ledger.send(&mut good_line, sequence));
             }
             write_all(&mut arm, &packet(to - 1)[..30]);
             drop(arm);
@@ -201,6 +213,13 @@ fn play(play: &Play) -> Outcome {
             });
         } else {
             last_arm = Some(arm);
+        }
+        for (sequence, end) in ledger.intact() {
+            if end as u64 <= stretch_bytes {
+                outcome.intact.insert(sequence);
+            } else {
+                outcome.at_risk.insert(sequence);
+            }
         }
     }
     outcome.statistics = feed.stop();
@@ -414,6 +433,81 @@ fn files_and_pipes_are_monitored() {
     assert_eq!(usage.status.code(), Some(2), "{}", told(&usage));
     let usage = endofield(&["arm", "simulate", "--pull", "5:1"], folder.path());
     assert_eq!(usage.status.code(), Some(2), "{}", told(&usage));
+}
+
+/// Another maker's arm: a letter, the slide in 1/100 mm, a letter, and no more; its time is counted in samples.
+#[derive(Default)]
+struct SlideDriver {
+    digits: Vec<u8>,
+    count: i64,
+    counts: DriverCounts,
+}
+
+impl Driver for SlideDriver {
+    fn name(&self) -> &'static str {
+        "slide"
+    }
+
+    fn take(&mut self, bytes: &[u8], deliver: &mut dyn FnMut(Message)) {
+        self.counts.bytes += bytes.len() as u64;
+        for byte in bytes {
+            match byte {
+                b'0'..=b'9' if self.digits.len() < 6 => self.digits.push(*byte),
+                _ => {
+                    let text = String::from_utf8(std::mem::take(&mut self.digits)).unwrap();
+                    let Ok(hundredths) = text.parse::<f64>() else { continue };
+                    self.count += 1;
+                    let joints = [hundredths / 100.0, 0.5, -0.7, 0.2, 0.3, -0.4, 0.1];
+                    deliver(Message {
+                        sequence: None,
+                        device_time: DeviceTime::Nanoseconds(self.count * 10_000_000),
+                        status: 0,
+                        faults: 0,
+                        reading: Reading::Joints(JointValues::new(&joints).unwrap()),
+                        fingerprint: 0,
+                    });
+                }
+            }
+        }
+    }
+
+    fn reset(&mut self, _joined: Joined) {
+        self.digits.clear();
+    }
+
+    fn counts(&self) -> DriverCounts {
+        self.counts
+    }
+
+    fn greeting(&self) -> &[u8] {
+        b"talk\n"
+    }
+}
+
+#[test]
+fn another_arm_is_one_driver() {
+    let mut arm = PseudoTerminal::open(None).unwrap();
+    let source = LineSource::Port(arm.path().to_owned());
+    let driver = Box::<SlideDriver>::default();
+    let poses = pose_buffer::Settings::default();
+    let feed = ArmFeed::start_with(driver, source, &Settings::default(), &poses, Arc::new(MonotonicClock), None).unwrap();
+    let mut greeting = Vec::new();
+    wait_for("the greeting", || {
+        let mut buffer = [0; 16];
+        let count = arm.read(&mut buffer).unwrap_or(0);
+        greeting.extend_from_slice(&buffer[..count]);
+        greeting == b"talk\n"
+    });
+    write_all(&mut arm, b"s20000e99999e20100e");
+    // 999.99 mm is beyond the slide's end.
+    wait_for("two poses", || feed.status().statistics.poses == 2);
+    let last = feed.status().last.unwrap().pose.base_from_hand.translation();
+    assert!(
+        (last - nalgebra::Vector3::new(715.126, 141.102, 162.636)).amax() < 1e-3,
+        "{last}"
+    );
+    assert!(feed.status().refusal.unwrap().contains("slide"));
+    assert_eq!(feed.stop().refused_joints, 1);
 }
 
 /// The stamps of a binary capture go on over the 32-bit wrap.

@@ -147,10 +147,15 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     } else {
         ""
     };
-    tracing::info!(
-        "the arm speaks; listen with: endofield arm monitor --port {}{format}",
-        port.path().display()
-    );
+    match &player.choice {
+        PortChoice::Serial(path) => {
+            tracing::info!("the arm speaks into {}; listen at the other end of that line", path.display())
+        }
+        PortChoice::Pseudo(_) => tracing::info!(
+            "the arm speaks; listen with: endofield arm monitor --port {}{format}",
+            port.path().display()
+        ),
+    }
     player.port = Some(port);
     let (total, endless) = player.total(args);
     context.console.begin("arm", if endless { 0 } else { total });

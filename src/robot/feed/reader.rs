@@ -110,6 +110,18 @@ impl ArmFeed {
         clock: Arc<dyn Clock>,
         tap: Option<Sender<Sample>>,
     ) -> Result<Self, FeedError> {
+        Self::start_with(driver(settings.protocol), source, settings, poses, clock, tap)
+    }
+
+    /// The same, with a driver of one's own.
+    pub fn start_with(
+        driver: Box<dyn Driver>,
+        source: LineSource,
+        settings: &Settings,
+        poses: &pose_buffer::Settings,
+        clock: Arc<dyn Clock>,
+        tap: Option<Sender<Sample>>,
+    ) -> Result<Self, FeedError> {
         settings.check().map_err(FeedError::Settings)?;
         let poses = SharedPoses(Arc::new(Mutex::new(PoseBuffer::new(poses)?)));
         let told = Arc::new(Mutex::new(Told {
@@ -126,7 +138,7 @@ impl ArmFeed {
         let stop = Arc::new(AtomicBool::new(false));
         let reader = Reader {
             source,
-            driver: driver(settings.protocol),
+            driver,
             intake: Intake::new(arm_of(settings)?, settings),
             settings: settings.clone(),
             poses: poses.clone(),
@@ -404,7 +416,8 @@ impl Reader {
                 LinkState::Absent(reason) => tracing::warn!("arm: {reason}"),
                 LinkState::Silent => tracing::debug!("arm: the line is silent"),
                 LinkState::Garbled => tracing::warn!(
-                    "arm: bytes come, but no messages; are arm.protocol and arm.baud ({}) right?",
+                    "arm: bytes come, but no messages; are arm.protocol ({}) and arm.baud ({}) right?",
+                    self.driver.name(),
                     self.settings.baud
                 ),
                 LinkState::Speaking => tracing::debug!("arm: messages come"),

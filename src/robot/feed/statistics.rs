@@ -108,7 +108,7 @@ pub struct FeedStatus {
     pub link: LinkState,
     /// Since when it is so.
     pub since: Timestamp,
-    /// Messages a second over the last ones; 0 when none came for a while.
+    /// Poses a second over the last ones; 0 when none came for a while.
     pub rate_hz: f64,
     /// How much later than at best they came.
     pub delays: Delays,
