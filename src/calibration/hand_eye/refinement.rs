@@ -1,7 +1,7 @@
 //! X, Z and what else is unknown, where the board is seen again.
 //!
-//! Made least is Σ ρ(‖π(X⁻¹·(Cᵥ·H_v(δ, q))⁻¹·Z·P) − u‖²/σ²) over corners P of views v, with the hand's pose H_v of view v at a time offset δ and
-//! joint offsets q, and a small correction C_v of each. Corrections have a prior whose deviations are found from the data: the mean
+//! Made least is Σ ρ(‖π((H_v(δ, q)·X·Cᵥ)⁻¹·Z·P) − u‖²/σ²) over corners P of views v, with the hand's pose H_v of view v at a time offset δ
+//! and joint offsets q, and a small correction C_v of where that puts the camera. Corrections have a prior whose deviations are found from the data: the mean
 //! squares of what the corrections are and of what they might be besides (expectation–maximization: Dempster, Laird and Rubin 1977),
 //! with heavy tails, so that a view whose hand was somewhere else is heard less (Student's t: Lange, Little and Taylor 1989).
 //!
@@ -53,9 +53,9 @@ pub struct Settings {
     pub time_offset: bool,
     /// Prior deviation of each joint's offset (mm or rad); none: joints are right.
     pub joint_sigma: Vec<f64>,
-    /// First guess of the hand's deviation, mm.
+    /// First guess of how far the camera is from where the arm puts it, along an axis, mm.
     pub place_sigma_mm: f64,
-    /// First guess of the hand's deviation, rad.
+    /// The same of its rotation about an axis, rad.
     pub turn_sigma_rad: f64,
     /// First guess of a corner's deviation along an axis, px.
     pub pixel_sigma: f64,
@@ -100,11 +100,12 @@ pub struct Refined {
     pub time_offset_s: [f64; 2],
     /// Per joint: offset to be added to its reading, and its deviation, mm or rad.
     pub joint_offsets: Vec<[f64; 2]>,
-    /// Per view, what was wrong with the hand: shift (mm) and rotation vector (rad) in the base's space.
+    /// Per view, what the arm told wrongly of the camera: shift (mm) and rotation vector (rad) in the camera's space.
     pub corrections: Vec<Vector6<f64>>,
     /// Per view, how far it is trusted: about 1 for one like the others, near 0 for one whose hand was elsewhere.
     pub trust: Vec<f64>,
-    /// Deviations found: hand's place along an axis (mm), rotation about an axis (rad), corner along an axis (px).
+    /// Deviations found: of the camera's place as the arm tells it along an axis (mm), of its rotation about an axis (rad), of a corner along
+    /// an axis (px).
     pub sigmas: [f64; 3],
     /// Root mean square of the residual vectors with the corrections, px.
     pub rms_px: f64,
@@ -139,7 +140,8 @@ pub fn refine(
         first: &first,
         joint_sigma: &settings.joint_sigma[..joints],
         time_offset: settings.time_offset,
-        sigmas: [settings.place_sigma_mm, settings.turn_sigma_rad, settings.pixel_sigma],
+        spread: Spread::isotropic(settings.place_sigma_mm, settings.turn_sigma_rad)?,
+        pixel_sigma: settings.pixel_sigma,
         trust: vec![1.0; views.len()],
     };
     let search = least_squares::Settings {
@@ -148,11 +150,11 @@ pub fn refine(
     };
     let mut solution = minimize(&view_problem, state, &search)?;
     for _ in 0..settings.rounds {
-        let before = view_problem.sigmas;
+        let before = view_problem.sigmas();
         view_problem.learn_deviations(&solution)?;
         state = solution.state.clone();
         solution = minimize(&view_problem, state, &search)?;
-        let moved = before.iter().zip(&view_problem.sigmas).map(|(a, b)| (a / b).ln().abs());
+        let moved = before.iter().zip(view_problem.sigmas()).map(|(a, b)| (a / b).ln().abs());
         if moved.fold(0.0, f64::max) < SETTLED {
             break;
         }
@@ -177,13 +179,49 @@ struct Reprojection<'a> {
     first: &'a [usize],
     joint_sigma: &'a [f64],
     time_offset: bool,
-    /// Place mm, turn rad, corner px.
-    sigmas: [f64; 3],
+    spread: Spread,
+    pixel_sigma: f64,
     trust: Vec<f64>,
 }
 
 /// What is known of a time offset before, so that stations at rest do not leave it undetermined, s.
 const TIME_OFFSET_SIGMA_S: f64 = 0.2;
+/// How the corrections spread: a joint's error moves and turns the camera at once, so shift and turn go together.
+struct Spread {
+    covariance: Matrix6<f64>,
+    information: Matrix6<f64>,
+    /// Turns a correction into standard deviations: the inverse of the covariance's lower root.
+    whitening: Matrix6<f64>,
+}
+
+/// A spread is held to be isotropic with the weight of so many views: few views do not tell how shift and turn go together.
+const ISOTROPIC_VIEWS: f64 = 8.0;
+
+impl Spread {
+    fn isotropic(place_mm: f64, turn_rad: f64) -> Option<Self> {
+        let [place, turn] = [place_mm.max(LEAST_SIGMAS[0]), turn_rad.max(LEAST_SIGMAS[1])].map(|sigma| sigma * sigma);
+        Self::of(Matrix6::from_diagonal(&Vector6::new(place, place, place, turn, turn, turn)))
+    }
+
+    /// From the sum over views of a correction's square.
+    fn learnt(sum: Matrix6<f64>, views: usize) -> Option<Self> {
+        let count = views as f64;
+        let variance = |first: usize| sum.fixed_view::<3, 3>(first, first).trace() / (3.0 * count);
+        let isotropic = Self::isotropic(variance(0).sqrt(), variance(3).sqrt())?;
+        Self::of((sum + ISOTROPIC_VIEWS * isotropic.covariance) / (count + ISOTROPIC_VIEWS))
+    }
+
+    fn of(covariance: Matrix6<f64>) -> Option<Self> {
+        let lower = covariance.cholesky()?.l();
+        let whitening = lower.try_inverse()?;
+        Some(Self {
+            covariance,
+            information: whitening.transpose() * whitening,
+            whitening,
+        })
+    }
+}
+
 /// Directions of X and Z.
 const POSES: usize = 12;
 
@@ -193,60 +231,51 @@ impl Reprojection<'_> {
         POSES + usize::from(self.time_offset) + self.joint_sigma.len()
     }
 
-    fn hand(&self, state: &State, view: usize) -> Option<Transform<RobotBase, Hand>> {
+    /// Where the camera was at a view.
+    fn eye(&self, state: &State, view: usize) -> Option<Transform<RobotBase, Camera>> {
         let told = self.hands.base_from_hand(view, state.time_offset_s, &state.joints)?;
-        Some(shifted(&told, state.corrections[view].as_slice()))
+        let correction: Transform<Camera, Camera> = shifted(&Transform::identity(), state.corrections[view].as_slice());
+        Some(told * state.hand_from_camera * correction)
     }
 
-    /// Where a view shows a corner from a hand's pose, minus where it was seen, px.
-    fn residual(&self, state: &State, base_from_hand: &Transform<RobotBase, Hand>, sighting: &Sighting) -> Option<[f64; 2]> {
-        let camera_from_board = (*base_from_hand * state.hand_from_camera).inverse() * state.base_from_board;
+    /// Where a view shows a corner from a camera's pose, minus where it was seen, px.
+    fn residual(&self, state: &State, base_from_camera: &Transform<RobotBase, Camera>, sighting: &Sighting) -> Option<[f64; 2]> {
+        let camera_from_board = base_from_camera.inverse() * state.base_from_board;
         let pixel = self.camera.project(camera_from_board * sighting.corner)?;
         Some([pixel.x - sighting.pixel.x, pixel.y - sighting.pixel.y])
+    }
+
+    /// Place mm, turn rad, corner px.
+    fn sigmas(&self) -> [f64; 3] {
+        let variance = |first: usize| self.spread.covariance.fixed_view::<3, 3>(first, first).trace() / 3.0;
+        [variance(0).sqrt(), variance(3).sqrt(), self.pixel_sigma]
     }
 
     /// Deviations and trust from what the corrections turned out to be.
     fn learn_deviations(&mut self, solution: &Solution<State>) -> Option<()> {
         let covariance = solution.covariance.as_ref()?;
         let common = self.common();
-        let [place, turn, pixel] = self.sigmas;
-        let (mut squares, mut trusts) = ([0.0; 2], 0.0);
+        let (mut sum, mut held) = (Matrix6::zeros(), 0.0);
         for (view, correction) in solution.state.corrections.iter().enumerate() {
+            let doubt: Matrix6<f64> = covariance
+                .fixed_view::<6, 6>(common + 6 * view, common + 6 * view)
+                .into_owned();
+            held += self.trust[view] * (self.spread.information * doubt).trace();
             // What it is, and what it might be besides.
-            let square =
-                |axis: usize| correction[axis].powi(2) + covariance[(common + 6 * view + axis, common + 6 * view + axis)];
-            let places: f64 = (0..3).map(square).sum();
-            let turns: f64 = (3..6).map(square).sum();
-            let trust = (TAIL + 6.0) / (TAIL + places / place.powi(2) + turns / turn.powi(2));
-            self.trust[view] = trust;
-            squares[0] += trust * places;
-            squares[1] += trust * turns;
-            trusts += 1.0;
+            let square = correction * correction.transpose() + doubt;
+            self.trust[view] = (TAIL + 6.0) / (TAIL + (self.spread.information * square).trace());
+            sum += self.trust[view] * square;
         }
-        let measured = self.measured();
-        // A corner within Huber's width counts in full; the residuals of Gaussian noise lose as many squares as there are unknowns.
-        let rest: f64 = (solution.residuals.rows(0, measured).iter().enumerate())
+        self.spread = Spread::learnt(sum, self.views.len())?;
+        // A corner within Huber's width counts in full; the residuals of Gaussian noise lose as many squares as there are unknowns, and
+        // of the corrections only as many are the picture's as the prior does not hold.
+        let rest: f64 = (solution.residuals.rows(0, self.measured()).iter().enumerate())
             .map(|(row, r)| solution.weights[row / 2] * r * r)
             .sum();
         let heard = 2.0 * solution.weights.iter().sum::<f64>();
-        let held: f64 = (0..self.views.len() * 6)
-            .map(|i| {
-                let (view, axis) = (i / 6, i % 6);
-                let sigma = if axis < 3 { place } else { turn };
-                self.trust[view] * covariance[(common + i, common + i)] / sigma.powi(2)
-            })
-            .sum();
-        // Of the corrections only as many are the picture's as the prior does not hold.
         let unknowns = common as f64 + (6 * self.views.len()) as f64 - held;
         let free = (heard - unknowns).max(1.0);
-        let new = [
-            (squares[0] / (3.0 * trusts)).sqrt(),
-            (squares[1] / (3.0 * trusts)).sqrt(),
-            pixel * (rest / free).sqrt(),
-        ];
-        for ((sigma, new), least) in self.sigmas.iter_mut().zip(new).zip(LEAST_SIGMAS) {
-            *sigma = new.max(least);
-        }
+        self.pixel_sigma = (self.pixel_sigma * (rest / free).sqrt()).max(LEAST_SIGMAS[2]);
         Some(())
     }
 
@@ -259,7 +288,7 @@ impl Reprojection<'_> {
         let joint_offsets =
             (state.joints.iter().enumerate()).map(|(joint, &offset)| [offset, deviation(first_joint + joint, covariance)]);
         let measured = self.measured();
-        let pixels: f64 = solution.residuals.rows(0, measured).norm_squared() * self.sigmas[2].powi(2);
+        let pixels: f64 = solution.residuals.rows(0, measured).norm_squared() * self.pixel_sigma.powi(2);
         let without = State {
             corrections: vec![Vector6::zeros(); self.views.len()],
             ..state.clone()
@@ -277,7 +306,7 @@ impl Reprojection<'_> {
             joint_offsets: joint_offsets.collect(),
             corrections: state.corrections.clone(),
             trust: self.trust.clone(),
-            sigmas: self.sigmas,
+            sigmas: self.sigmas(),
             rms_px: (pixels / (measured / 2) as f64).sqrt(),
             predicted_px: (0..self.views.len()).map(|view| self.rms_of(&without, view)).collect(),
         })
@@ -285,11 +314,11 @@ impl Reprojection<'_> {
 
     /// Root mean square of a view's residual vectors, px.
     fn rms_of(&self, state: &State, view: usize) -> f64 {
-        let Some(hand) = self.hand(state, view) else {
+        let Some(eye) = self.eye(state, view) else {
             return f64::NAN;
         };
         let squares = (self.views[view].iter())
-            .map(|sighting| (self.residual(state, &hand, sighting)).map_or(f64::NAN, |[x, y]| x * x + y * y));
+            .map(|sighting| (self.residual(state, &eye, sighting)).map_or(f64::NAN, |[x, y]| x * x + y * y));
         (squares.sum::<f64>() / self.views[view].len() as f64).sqrt()
     }
 }
@@ -318,16 +347,16 @@ impl Problem for Reprojection<'_> {
         let mut row = rows.start;
         while row < rows.end.min(measured) {
             let view = self.first.partition_point(|&first| first <= row) - 1;
-            let hand = self.hand(state, view);
+            let eye = self.eye(state, view);
             let end = self.first[view + 1].min(rows.end);
             while row < end {
                 let sighting = &self.views[view][(row - self.first[view]) / 2];
-                let residual = hand
-                    .and_then(|hand| self.residual(state, &hand, sighting))
+                let residual = eye
+                    .and_then(|eye| self.residual(state, &eye, sighting))
                     .unwrap_or([f64::NAN; 2]);
                 // Blocks are asked for whole.
-                out[row - rows.start] = residual[0] / self.sigmas[2];
-                out[row + 1 - rows.start] = residual[1] / self.sigmas[2];
+                out[row - rows.start] = residual[0] / self.pixel_sigma;
+                out[row + 1 - rows.start] = residual[1] / self.pixel_sigma;
                 row += 2;
             }
         }
@@ -338,8 +367,8 @@ impl Problem for Reprojection<'_> {
                 Some(_) => state.time_offset_s / TIME_OFFSET_SIGMA_S,
                 None => {
                     let (view, axis) = (prior / 6, prior % 6);
-                    let sigma = self.sigmas[usize::from(axis >= 3)];
-                    self.trust[view].sqrt() * state.corrections[view][axis] / sigma
+                    let whitened = self.spread.whitening.row(axis).transpose().dot(&state.corrections[view]);
+                    self.trust[view].sqrt() * whitened
                 }
             };
         }
@@ -370,7 +399,8 @@ impl Problem for Reprojection<'_> {
         match direction.checked_sub(common) {
             Some(correction) => {
                 let view = correction / 6;
-                vec![self.first[view]..self.first[view + 1], own(correction)]
+                let first = measured + 6 * view;
+                vec![self.first[view]..self.first[view + 1], first..first + 6]
             }
             None => match direction.checked_sub(POSES + usize::from(self.time_offset)) {
                 Some(joint) => vec![0..measured, own(6 * self.views.len() + joint)],
