@@ -97,40 +97,57 @@ impl HandPoses for Chosen<'_> {
     }
 }
 
-/// Each view predicted from a calibration on all others: by the refinement, or with a closed form by that. `None` where the others do not
-/// suffice.
-pub fn leave_one_out(
+/// More folds than this tell no more, and each costs a calibration.
+const MOST_FOLDS: usize = 12;
+
+/// Each view predicted from a calibration that has not seen it: by the refinement, or with a closed form by that. Few views are left out
+/// one by one, many in folds. `None` where the others do not suffice.
+pub fn leave_out(
     views: &[StationView],
     hands: &dyn HandPoses,
     camera: &CameraModel,
     settings: &Settings,
     method: Option<Method>,
 ) -> Vec<Option<Held>> {
-    let held = |left_out: usize| {
-        let numbers: Vec<usize> = (0..views.len()).filter(|&view| view != left_out).collect();
+    let folds = views.len().min(MOST_FOLDS);
+    let mut held = vec![None; views.len()];
+    for fold in 0..folds {
+        let (left_out, numbers): (Vec<usize>, Vec<usize>) = (0..views.len()).partition(|view| view % folds == fold);
         let rest: Vec<StationView> = numbers.iter().map(|&view| views[view].clone()).collect();
-        let chosen = Chosen { all: hands, numbers };
-        let (x, z, offset_s, offsets) = match method {
-            None => {
-                let refined = calibrate(&rest, &chosen, camera, settings).ok()?;
-                let offsets = refined.joint_offsets.iter().map(|[offset, _]| *offset).collect();
-                (
-                    refined.hand_from_camera,
-                    refined.base_from_board,
-                    refined.time_offset_s[0],
-                    offsets,
-                )
-            }
-            Some(method) => {
-                let stations = stations(&rest, &chosen);
-                let x = method.solve(&stations)?;
-                (x, board_of(&stations, &x)?, 0.0, vec![0.0; hands.joints()])
-            }
+        let Some((x, z, offset_s, offsets)) = calibrated(&rest, &Chosen { all: hands, numbers }, camera, settings, method) else {
+            continue;
         };
-        let hand = hands.base_from_hand(left_out, offset_s, &offsets)?;
-        predicted(&views[left_out], camera, (hand * x).inverse() * z)
+        for view in left_out {
+            let hand = hands.base_from_hand(view, offset_s, &offsets);
+            held[view] = hand.and_then(|hand| predicted(&views[view], camera, (hand * x).inverse() * z));
+        }
+    }
+    held
+}
+
+/// X, Z, time offset (s) and joint offsets.
+type Calibrated = (Transform<Hand, Camera>, Transform<RobotBase, Board>, f64, Vec<f64>);
+
+fn calibrated(
+    views: &[StationView],
+    hands: &dyn HandPoses,
+    camera: &CameraModel,
+    settings: &Settings,
+    method: Option<Method>,
+) -> Option<Calibrated> {
+    let Some(method) = method else {
+        let refined = calibrate(views, hands, camera, settings).ok()?;
+        let offsets = refined.joint_offsets.iter().map(|[offset, _]| *offset).collect();
+        return Some((
+            refined.hand_from_camera,
+            refined.base_from_board,
+            refined.time_offset_s[0],
+            offsets,
+        ));
     };
-    (0..views.len()).map(held).collect()
+    let stations = stations(views, hands);
+    let x = method.solve(&stations)?;
+    Some((x, board_of(&stations, &x)?, 0.0, vec![0.0; hands.joints()]))
 }
 
 fn predicted(view: &StationView, camera: &CameraModel, camera_from_board: Transform<Camera, Board>) -> Option<Held> {
@@ -146,4 +163,78 @@ fn predicted(view: &StationView, camera: &CameraModel, camera_from_board: Transf
         rms_px: (squares / count).sqrt(),
         board_mm: middle.norm() / count,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::calibration::hand_eye::example::{Example, Noise};
+    use crate::camera::distortion::Distortion;
+    use crate::camera::intrinsics::Intrinsics;
+    use crate::geometry::point::Point;
+
+    fn camera() -> CameraModel {
+        CameraModel {
+            width: 960,
+            height: 540,
+            intrinsics: Intrinsics {
+                fx: 800.0,
+                fy: 800.0,
+                cx: 480.0,
+                cy: 270.0,
+            },
+            distortion: Distortion::None,
+        }
+    }
+
+    fn views_of(example: &Example) -> Vec<StationView> {
+        let corners: Vec<Point<Board>> = (0..20)
+            .map(|i| Point::new(f64::from(i % 5) * 8.0, f64::from(i / 5) * 8.0, 0.0))
+            .collect();
+        let view = |station: &Station| StationView {
+            camera_from_board: station.camera_from_board,
+            sightings: (corners.iter())
+                .map(|&corner| Sighting {
+                    corner,
+                    pixel: camera().project(station.camera_from_board * corner).unwrap(),
+                })
+                .collect(),
+        };
+        example.stations.iter().map(view).collect()
+    }
+
+    #[test]
+    fn exact_stations_predict_what_was_left_out_and_a_wrong_one_is_seen() {
+        let mut example = Example::new(3, 14, Noise::NONE);
+        let views = views_of(&example);
+        example.disturb(5, Vector3::new(5.0, 0.0, -4.0), Vector3::new(0.02, 0.03, 0.0));
+        let hands: Vec<_> = example.stations.iter().map(|station| station.base_from_hand).collect();
+        let settings = Settings::default();
+        let refined = calibrate(&views, &hands, &camera(), &settings).unwrap();
+        let [mm, rad] = example.error_of(&refined.hand_from_camera);
+        assert!(mm < 0.05 && rad < 3e-4, "{mm} mm, {rad} rad");
+        assert!(
+            (0..14).all(|view| (refined.trust[view] < 0.4) == (view == 5)),
+            "{:?}",
+            refined.trust
+        );
+        let held = leave_out(&views, &hands, &camera(), &settings, None);
+        for (view, held) in held.iter().enumerate() {
+            let held = held.unwrap();
+            assert_eq!(held.rms_px > 5.0, view == 5, "{view}: {held:?}");
+        }
+    }
+
+    #[test]
+    fn inverted_poses_are_refused_as_contradictory_or_leave_much_over() {
+        let example = Example::new(4, 10, Noise::NONE);
+        let views = views_of(&example);
+        let inverted: Vec<Transform<RobotBase, Hand>> = (example.stations.iter())
+            .map(|station| Transform::from_isometry(station.base_from_hand.isometry().inverse()))
+            .collect();
+        if let Ok(refined) = calibrate(&views, &inverted, &camera(), &Settings::default()) {
+            let least = refined.predicted_px.iter().copied().fold(f64::INFINITY, f64::min);
+            assert!(refined.sigmas[0] > 1.0 || least > 2.0, "{:?}", refined.predicted_px);
+        }
+    }
 }

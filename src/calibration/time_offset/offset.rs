@@ -28,6 +28,8 @@ const FINE_MS: f64 = 1.0;
 const FINE_REACH_MS: f64 = 12.0;
 /// The hand's motion: six numbers, and one for what the picture does of itself.
 const INPUTS: usize = 7;
+/// With fewer independent windows the linear function bends to whatever the camera did: some ten seconds are wanted.
+const SURE_WINDOWS: f64 = 50.0;
 /// Fewer windows than this that do not overlap tell nothing.
 const LEAST_WINDOWS: f64 = 12.0;
 
@@ -62,7 +64,7 @@ pub struct Offset {
 impl Offset {
     /// Whether it may be relied on.
     pub fn is_sure(&self) -> bool {
-        self.sigma_ms < 20.0 && self.explained > 0.3 && self.distinctness > 3.0
+        self.sigma_ms < 20.0 && self.explained > 0.3 && self.distinctness > 3.0 && self.windows[1] > SURE_WINDOWS
     }
 }
 

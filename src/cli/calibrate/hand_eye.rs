@@ -9,7 +9,7 @@ use serde::Serialize;
 
 use crate::calibration::board::BoardLayout;
 use crate::calibration::detection::{Detection, detect};
-use crate::calibration::hand_eye::calibrate::{Held, StationView, calibrate, leave_one_out, stations};
+use crate::calibration::hand_eye::calibrate::{Held, StationView, calibrate, leave_out, stations};
 use crate::calibration::hand_eye::method::METHODS;
 use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings, Sighting};
 use crate::calibration::pose::board_pose;
@@ -27,8 +27,8 @@ use crate::robot::pose_buffer::PoseBuffer;
 use crate::robot::trajectory::TumFile;
 use crate::time::{Span, Timestamp};
 
-/// A view trusted less than this is named as wrong.
-const LITTLE_TRUST: f64 = 0.25;
+/// A view trusted less than this is named as wrong: one of a thousand right ones is (χ² of six degrees above 22.5).
+const LITTLE_TRUST: f64 = 0.4;
 /// Corners that a view must show.
 const LEAST_CORNERS: usize = 6;
 
@@ -64,7 +64,7 @@ pub struct Args {
     #[arg(long, value_name = "MM")]
     square_mm: f64,
     /// Frames looked at, of a recording.
-    #[arg(long, default_value_t = 60, value_parser = clap::value_parser!(u32).range(3..=2000))]
+    #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u32).range(3..=200))]
     frames: u32,
     /// The arm's kinematics, to read joints.csv with; with it constant joint offsets can be found.
     #[arg(long, value_name = "FILE")]
@@ -404,9 +404,9 @@ struct Compared {
     /// Difference to the joint refinement.
     off_mm: Option<f64>,
     off_deg: Option<f64>,
-    /// Mean over views left out.
-    left_out_px: Option<f64>,
-    left_out_mm: Option<f64>,
+    /// Mean and median over views left out.
+    left_out_px: Option<[f64; 2]>,
+    left_out_mm: Option<[f64; 2]>,
 }
 
 #[derive(Debug, Serialize)]
@@ -439,7 +439,7 @@ impl Report {
         names: &[String],
         left_out_pictures: Vec<String>,
     ) -> Self {
-        let held = leave_one_out(views, hands, camera, settings, None);
+        let held = leave_out(views, hands, camera, settings, None);
         let x = refined.hand_from_camera;
         let q = x.rotation();
         let deviation = |i: usize| refined.covariance[(i, i)].max(0.0).sqrt();
@@ -459,7 +459,7 @@ impl Report {
         let stations = stations(views, hands);
         let mut methods: Vec<Compared> = vec![compared("joint refinement", Some(x), &x, &held)];
         methods.extend(METHODS.iter().map(|&method| {
-            let held = leave_one_out(views, hands, camera, settings, Some(method));
+            let held = leave_out(views, hands, camera, settings, Some(method));
             compared(method.name(), method.solve(&stations), &x, &held)
         }));
         let mut warnings = Vec::new();
@@ -546,14 +546,19 @@ impl Report {
                 if view.wrong { "  WRONG" } else { "" }
             );
         }
-        let _ = writeln!(text, "\n  method             differs by           stations left out, mean");
+        let _ = writeln!(
+            text,
+            "\n  method             differs by           stations left out, mean (median)"
+        );
         for method in &self.methods {
             let off = match (method.off_mm, method.off_deg) {
                 (Some(mm), Some(deg)) => format!("{mm:.3} mm {deg:.3}°"),
                 _ => "no answer".to_owned(),
             };
             let held = match (method.left_out_px, method.left_out_mm) {
-                (Some(px), Some(mm)) => format!("{px:.3} px {mm:.3} mm"),
+                (Some([px, middle_px]), Some([mm, middle_mm])) => {
+                    format!("{px:.3} ({middle_px:.3}) px {mm:.3} ({middle_mm:.3}) mm")
+                }
                 _ => "–".to_owned(),
             };
             let _ = writeln!(text, "  {:<18} {off:<20} {held}", method.method);
@@ -571,17 +576,19 @@ fn compared(
     reference: &Transform<Hand, crate::geometry::space::Camera>,
     held: &[Option<Held>],
 ) -> Compared {
-    let mean = |of: &dyn Fn(&Held) -> f64| {
+    let summed = |of: &dyn Fn(&Held) -> f64| {
         let values: Option<Vec<f64>> = held.iter().map(|held| held.as_ref().map(of)).collect();
-        values
-            .filter(|values| !values.is_empty())
-            .map(|values| values.iter().sum::<f64>() / values.len() as f64)
+        let mut values = values.filter(|values| !values.is_empty())?;
+        values.sort_by(f64::total_cmp);
+        let middle = values.len() / 2;
+        let median = 0.5 * (values[middle] + values[(values.len() - 1) / 2]);
+        Some([values.iter().sum::<f64>() / values.len() as f64, median])
     };
     Compared {
         method,
         off_mm: found.map(|found| (found.translation() - reference.translation()).norm()),
         off_deg: found.map(|found| found.rotation().angle_to(&reference.rotation()).to_degrees()),
-        left_out_px: mean(&|held| held.rms_px),
-        left_out_mm: mean(&|held| held.board_mm),
+        left_out_px: summed(&|held| held.rms_px),
+        left_out_mm: summed(&|held| held.board_mm),
     }
 }
