@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use endofield::calibration::board::BoardLayout;
-use endofield::calibration::cross_validation::cross_validated;
-use endofield::calibration::detection::{BoardCorner, Detection, detect};
-use endofield::calibration::lens::{self, LensModel};
-use endofield::calibration::placement::Naming;
-use endofield::calibration::refine::{View, calibrate};
+use endofield::calibration::board::detection::{BoardCorner, Detection, detect};
+use endofield::calibration::board::pattern::BoardLayout;
+use endofield::calibration::board::placement::Naming;
+use endofield::calibration::camera::cross_validation::cross_validated;
+use endofield::calibration::camera::lens::{self, LensModel};
+use endofield::calibration::camera::refine::{View, calibrate};
 use endofield::camera::distortion::Distortion;
 use endofield::camera::file;
 use endofield::camera::intrinsics::{Intrinsics, Pixel};

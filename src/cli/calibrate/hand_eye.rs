@@ -7,12 +7,12 @@ use anyhow::Context as _;
 use nalgebra::Matrix4;
 use serde::Serialize;
 
-use crate::calibration::board::BoardLayout;
-use crate::calibration::detection::{Detection, detect};
+use crate::calibration::board::detection::{Detection, detect};
+use crate::calibration::board::pattern::BoardLayout;
+use crate::calibration::camera::pose::board_pose;
 use crate::calibration::hand_eye::calibrate::{Held, StationView, calibrate, leave_out, stations};
 use crate::calibration::hand_eye::method::METHODS;
 use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings, Sighting};
-use crate::calibration::pose::board_pose;
 use crate::camera::file;
 use crate::camera::model::CameraModel;
 use crate::cli::calibrate::pictures::{Seen, look_at_all};

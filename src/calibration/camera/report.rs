@@ -4,11 +4,11 @@ use std::fmt::Write as _;
 
 use serde::Serialize;
 
-use crate::calibration::coverage::{self, Coverage, Lit};
-use crate::calibration::cross_validation::Difference;
-use crate::calibration::lens;
-use crate::calibration::placement::Naming;
-use crate::calibration::refine::{Calibration, ViewResult};
+use crate::calibration::board::placement::Naming;
+use crate::calibration::camera::coverage::{self, Coverage, Lit};
+use crate::calibration::camera::cross_validation::Difference;
+use crate::calibration::camera::lens;
+use crate::calibration::camera::refine::{Calibration, ViewResult};
 
 /// A view whose RMS is this many times the median view's stands out.
 const OUTLIER_VIEW: f64 = 2.5;

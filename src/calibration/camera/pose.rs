@@ -9,7 +9,7 @@ use std::ops::Range;
 
 use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 
-use crate::calibration::detection::BoardCorner;
+use crate::calibration::board::detection::BoardCorner;
 use crate::calibration::homography;
 use crate::camera::model::CameraModel;
 use crate::geometry::point::Point;
@@ -202,7 +202,7 @@ mod tests {
     use rand_distr::StandardNormal;
 
     use super::*;
-    use crate::calibration::board::BoardLayout;
+    use crate::calibration::board::pattern::BoardLayout;
     use crate::camera::distortion::Distortion;
     use crate::camera::intrinsics::{Intrinsics, Pixel};
 

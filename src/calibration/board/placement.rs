@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::calibration::board::{BoardLayout, Pattern, Site};
-use crate::calibration::lattice::{Cell, Lattice};
+use crate::calibration::board::lattice::{Cell, Lattice};
+use crate::calibration::board::pattern::{BoardLayout, Pattern, Site};
 use crate::camera::intrinsics::Pixel;
 
 /// How sure it is which corner is which.

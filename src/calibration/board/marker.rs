@@ -5,7 +5,7 @@
 
 use std::str::FromStr;
 
-use crate::calibration::marker_tables::{MARKERS_4X4, MARKERS_5X5, MARKERS_6X6, MARKERS_7X7};
+use crate::calibration::board::marker_tables::{MARKERS_4X4, MARKERS_5X5, MARKERS_6X6, MARKERS_7X7};
 
 /// The first so many markers of n × n cells.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -1,9 +1,9 @@
 //! A picture of a calibration: left the residual vectors where they are in the image field, right how far two halves of the views
 //! disagree; the white line is the area in which corners were seen.
 
-use crate::calibration::coverage::hull;
-use crate::calibration::cross_validation::Difference;
-use crate::calibration::refine::Calibration;
+use crate::calibration::camera::coverage::hull;
+use crate::calibration::camera::cross_validation::Difference;
+use crate::calibration::camera::refine::Calibration;
 use crate::camera::intrinsics::Pixel;
 use crate::image::buffer::{Image, Rgb8};
 
@@ -117,7 +117,7 @@ pub fn drawn(calibration: &Calibration, difference: Option<&Difference>) -> Imag
     canvas
 }
 
-fn residuals(calibration: &Calibration) -> impl Iterator<Item = &crate::calibration::refine::Residual> {
+fn residuals(calibration: &Calibration) -> impl Iterator<Item = &crate::calibration::camera::refine::Residual> {
     calibration.views.iter().flat_map(|view| &view.residuals)
 }
 

@@ -7,12 +7,12 @@
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
-use crate::calibration::board::{BoardLayout, Pattern};
-use crate::calibration::detection::{BoardCorner, Detection};
-use crate::calibration::lattice::{Cell, Lattice, Seed, grown};
-use crate::calibration::placement::{Placed, placed};
-use crate::calibration::saddle::bilinear;
-use crate::calibration::stray::without_strays;
+use crate::calibration::board::detection::{BoardCorner, Detection};
+use crate::calibration::board::lattice::{Cell, Lattice, Seed, grown};
+use crate::calibration::board::pattern::{BoardLayout, Pattern};
+use crate::calibration::board::placement::{Placed, placed};
+use crate::calibration::board::saddle::bilinear;
+use crate::calibration::board::stray::without_strays;
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::image::blur::{BlurScratch, box_blur};

@@ -1,6 +1,6 @@
 //! The camera from its views of a board: intrinsics, lens and all board poses together, by least squares on the pixels.
 //!
-//! A closed-form start ([`crate::calibration::zhang`]) and a few focal lengths beside it are each refined with one radial term; the best
+//! A closed-form start ([`crate::calibration::camera::zhang`]) and a few focal lengths beside it are each refined with one radial term; the best
 //! goes on with all parameters under a Huber loss, whose width follows the residuals (Triggs et al. 2000). Corners farther off than six
 //! deviations are then left out, with their names kept, and the rest is solved by plain least squares: its covariance is
 //! σ²(JᵀJ)⁻¹, σ² from the residuals. Dots: the middle of a dot's picture is not the picture of its middle; the difference follows from
@@ -11,10 +11,11 @@ use std::ops::Range;
 use nalgebra::{DMatrix, Matrix3, Vector6};
 use rayon::prelude::*;
 
-use crate::calibration::detection::BoardCorner;
+use crate::calibration::board::detection::BoardCorner;
+use crate::calibration::camera::lens::{self, LensModel};
+use crate::calibration::camera::{pose, zhang};
 use crate::calibration::error::{CalibrationError, LEAST_VIEWS};
-use crate::calibration::lens::{self, LensModel};
-use crate::calibration::{homography, pose, zhang};
+use crate::calibration::homography;
 use crate::camera::intrinsics::{Intrinsics, Pixel};
 use crate::camera::model::CameraModel;
 use crate::geometry::point::Point;

@@ -7,13 +7,13 @@
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
 
-use crate::calibration::board::{BoardLayout, Site};
-use crate::calibration::corner_fit::{FittedCorner, Start, fitted};
-use crate::calibration::detection::{BoardCorner, Detection};
-use crate::calibration::lattice::{Cell, Lattice, Seed, grown};
-use crate::calibration::placement::{Placed, placed};
-use crate::calibration::saddle::{Saddle, saddles};
-use crate::calibration::stray::without_strays;
+use crate::calibration::board::corner_fit::{FittedCorner, Start, fitted};
+use crate::calibration::board::detection::{BoardCorner, Detection};
+use crate::calibration::board::lattice::{Cell, Lattice, Seed, grown};
+use crate::calibration::board::pattern::{BoardLayout, Site};
+use crate::calibration::board::placement::{Placed, placed};
+use crate::calibration::board::saddle::{Saddle, saddles};
+use crate::calibration::board::stray::without_strays;
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::image::buffer::Image;

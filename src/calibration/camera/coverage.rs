@@ -5,8 +5,8 @@
 
 use nalgebra::Vector3;
 
-use crate::calibration::lens;
-use crate::calibration::refine::Calibration;
+use crate::calibration::camera::lens;
+use crate::calibration::camera::refine::Calibration;
 use crate::camera::intrinsics::Pixel;
 use crate::image::buffer::{Image, Rgb8};
 

@@ -7,7 +7,7 @@
 
 use nalgebra::{Matrix2, SMatrix, SVector, Vector2};
 
-use crate::calibration::charuco::Print;
+use crate::calibration::board::charuco::Print;
 use crate::camera::intrinsics::Pixel;
 use crate::image::buffer::Image;
 

@@ -1,9 +1,9 @@
 //! A board found in a picture: which of its corners are seen, and where.
 
-use crate::calibration::board::{BoardLayout, Pattern};
-use crate::calibration::charuco::Print;
-use crate::calibration::placement::Naming;
-use crate::calibration::{charuco, checkerboard, circles, marker_search, saddle};
+use crate::calibration::board::charuco::Print;
+use crate::calibration::board::pattern::{BoardLayout, Pattern};
+use crate::calibration::board::placement::Naming;
+use crate::calibration::board::{charuco, checkerboard, circles, marker_search, saddle};
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::geometry::space::Board;

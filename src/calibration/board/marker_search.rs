@@ -2,10 +2,10 @@
 
 use nalgebra::Matrix3;
 
-use crate::calibration::coverage::hull;
+use crate::calibration::board::marker::Dictionary;
+use crate::calibration::board::saddle::bilinear;
+use crate::calibration::camera::coverage::hull;
 use crate::calibration::homography::{from_pairs, mapped};
-use crate::calibration::marker::Dictionary;
-use crate::calibration::saddle::bilinear;
 use crate::camera::intrinsics::Pixel;
 use crate::image::blur::{BlurScratch, box_blur};
 use crate::image::buffer::Image;

@@ -8,10 +8,10 @@ use std::ops::Range;
 
 use nalgebra::Vector6;
 
-use crate::calibration::coverage::{self, inside, middles, used_pixels};
+use crate::calibration::camera::coverage::{self, inside, middles, used_pixels};
+use crate::calibration::camera::lens::LensModel;
+use crate::calibration::camera::refine::{Calibration, View, calibrate};
 use crate::calibration::error::LEAST_VIEWS;
-use crate::calibration::lens::LensModel;
-use crate::calibration::refine::{Calibration, View, calibrate};
 use crate::camera::intrinsics::Pixel;
 use crate::camera::model::CameraModel;
 use crate::geometry::point::Point;

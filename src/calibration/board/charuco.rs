@@ -2,21 +2,21 @@
 //!
 //! A few markers are enough. Their ids say where on the board they are, their corners give a first map from board to picture, and from
 //! there on everything is known: how the picture must look around each corner of the board, markers and all. Each corner is found by
-//! fitting that look to the pixels ([`crate::calibration::pattern_fit`]), from the markers outward, corner by corner, as far as the
+//! fitting that look to the pixels ([`crate::calibration::board::pattern_fit`]), from the markers outward, corner by corner, as far as the
 //! board is seen.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use nalgebra::{Matrix2, Matrix3};
 
-use crate::calibration::board::BoardLayout;
-use crate::calibration::detection::{BoardCorner, Detection};
+use crate::calibration::board::detection::{BoardCorner, Detection};
+use crate::calibration::board::marker::Dictionary;
+use crate::calibration::board::marker_search::{FoundMarker, markers};
+use crate::calibration::board::pattern::BoardLayout;
+use crate::calibration::board::pattern_fit::{FittedSite, fitted, typical_blur_px};
+use crate::calibration::board::placement::Naming;
+use crate::calibration::board::stray::without_strays;
 use crate::calibration::homography::{from_pairs, mapped};
-use crate::calibration::marker::Dictionary;
-use crate::calibration::marker_search::{FoundMarker, markers};
-use crate::calibration::pattern_fit::{FittedSite, fitted, typical_blur_px};
-use crate::calibration::placement::Naming;
-use crate::calibration::stray::without_strays;
 use crate::camera::intrinsics::Pixel;
 use crate::geometry::point::Point;
 use crate::image::buffer::Image;

@@ -3,8 +3,8 @@
 
 use std::collections::BTreeMap;
 
+use crate::calibration::board::lattice::Cell;
 use crate::calibration::homography::{from_pairs, mapped};
-use crate::calibration::lattice::Cell;
 use crate::camera::intrinsics::Pixel;
 
 /// A corner may lie this share of a step beside its prediction.

@@ -15,7 +15,7 @@
 use std::collections::BTreeSet;
 use std::str::FromStr;
 
-use crate::calibration::marker::Dictionary;
+use crate::calibration::board::marker::Dictionary;
 
 /// Most columns or rows.
 const MOST: usize = 200;
