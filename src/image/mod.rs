@@ -2,6 +2,7 @@
 
 pub mod blur;
 pub mod buffer;
+pub mod canvas;
 pub mod color;
 pub mod components;
 pub mod corners;
