@@ -214,9 +214,9 @@ mod tests {
         let [mm, rad] = example.error_of(&refined.hand_from_camera);
         assert!(mm < 0.05 && rad < 3e-4, "{mm} mm, {rad} rad");
         assert!(
-            (0..14).all(|view| (refined.trust[view] < 0.4) == (view == 5)),
+            (0..14).all(|view| refined.outlier[view] == (view == 5)),
             "{:?}",
-            refined.trust
+            refined.distance
         );
         let held = leave_out(&views, &hands, &camera(), &settings, None);
         for (view, held) in held.iter().enumerate() {

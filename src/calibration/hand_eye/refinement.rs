@@ -2,8 +2,9 @@
 //!
 //! Made least is Σ ρ(‖π((H_v(δ, q)·X·Cᵥ)⁻¹·Z·P) − u‖²/σ²) over corners P of views v, with the hand's pose H_v of view v at a time offset δ
 //! and joint offsets q, and a small correction C_v of where that puts the camera. Corrections have a prior whose deviations are found from the data: the mean
-//! squares of what the corrections are and of what they might be besides (expectation–maximization: Dempster, Laird and Rubin 1977),
-//! with heavy tails, so that a view whose hand was somewhere else is heard less (Student's t: Lange, Little and Taylor 1989).
+//! squares of what the corrections are and of what they might be besides (expectation–maximization: Dempster, Laird and Rubin 1977).
+//! First with heavy tails, so that a view whose hand was somewhere else is heard less (Student's t: Lange, Little and Taylor 1989); then
+//! views far beyond the others are no longer heard at all and the rest counts in full, as normal errors should.
 //!
 //! Pose errors and reprojection errors as objectives are compared by Tabb and Ahmad Yousef 2017 and by Ali et al. 2019; with the arm's
 //! errors as unknowns of their own the reprojection keeps the meaning that its covariance needs.
@@ -78,6 +79,13 @@ impl Default for Settings {
 
 /// Degrees of freedom of Student's t: few enough that a wrong view is let go, enough that right ones count nearly in full.
 const TAIL: f64 = 5.0;
+/// A view is an outlier when the square of its correction, in deviations that the middle view tells, is above this: of six normal numbers
+/// that happens once in two million, and still once in a thousand when ten views tell the deviations too small by 1.4.
+const DISTANT: f64 = 40.0;
+/// Median of χ² of three degrees of freedom: the middle view's squared shift, or turn, in variances along an axis.
+const MIDDLE: f64 = 2.366;
+/// Weight of an outlier's prior: its correction is free, so that it tells nothing of X and Z.
+const UNHEARD: f64 = 1e-6;
 /// The deviations found no longer move by more than this share.
 const SETTLED: f64 = 0.01;
 /// Deviations never fall below these, mm, rad, px: with exact data the corrections would have no room for rounding.
@@ -102,8 +110,10 @@ pub struct Refined {
     pub joint_offsets: Vec<[f64; 2]>,
     /// Per view, what the arm told wrongly of the camera: shift (mm) and rotation vector (rad) in the camera's space.
     pub corrections: Vec<Vector6<f64>>,
-    /// Per view, how far it is trusted: about 1 for one like the others, near 0 for one whose hand was elsewhere.
-    pub trust: Vec<f64>,
+    /// Per view, whether its hand was elsewhere than the arm said: such a view is not heard.
+    pub outlier: Vec<bool>,
+    /// Per view, the square of its correction in deviations that the middle view tells: about 6 for one like the others.
+    pub distance: Vec<f64>,
     /// Deviations found: of the camera's place as the arm tells it along an axis (mm), of its rotation about an axis (rad), of a corner along
     /// an axis (px).
     pub sigmas: [f64; 3],
@@ -126,7 +136,7 @@ pub fn refine(
         first.push(first.last()? + 2 * view.len());
     }
     let joints = hands.joints().min(settings.joint_sigma.len());
-    let mut state = State {
+    let state = State {
         hand_from_camera,
         base_from_board,
         time_offset_s: 0.0,
@@ -143,21 +153,19 @@ pub fn refine(
         spread: Spread::isotropic(settings.place_sigma_mm, settings.turn_sigma_rad)?,
         pixel_sigma: settings.pixel_sigma,
         trust: vec![1.0; views.len()],
+        outlier: vec![false; views.len()],
+        distance: vec![0.0; views.len()],
+        tail: Some(TAIL),
     };
     let search = least_squares::Settings {
         least_gain: 1e-10,
         ..least_squares::Settings::default()
     };
     let mut solution = minimize(&view_problem, state, &search)?;
-    for _ in 0..settings.rounds {
-        let before = view_problem.sigmas();
-        view_problem.learn_deviations(&solution)?;
-        state = solution.state.clone();
-        solution = minimize(&view_problem, state, &search)?;
-        let moved = before.iter().zip(view_problem.sigmas()).map(|(a, b)| (a / b).ln().abs());
-        if moved.fold(0.0, f64::max) < SETTLED {
-            break;
-        }
+    solution = view_problem.settled(solution, &search, settings.rounds)?;
+    if settings.rounds > 0 {
+        view_problem.leave_out_outliers(&solution)?;
+        solution = view_problem.settled(solution, &search, settings.rounds)?;
     }
     view_problem.answer(solution)
 }
@@ -181,7 +189,12 @@ struct Reprojection<'a> {
     time_offset: bool,
     spread: Spread,
     pixel_sigma: f64,
+    /// Weight of each view's prior.
     trust: Vec<f64>,
+    outlier: Vec<bool>,
+    distance: Vec<f64>,
+    /// Degrees of freedom of Student's t; none: normal.
+    tail: Option<f64>,
 }
 
 /// What is known of a time offset before, so that stations at rest do not leave it undetermined, s.
@@ -251,22 +264,77 @@ impl Reprojection<'_> {
         [variance(0).sqrt(), variance(3).sqrt(), self.pixel_sigma]
     }
 
+    /// The answer whose corrections spread as the prior says.
+    fn settled(
+        &mut self,
+        mut solution: Solution<State>,
+        search: &least_squares::Settings,
+        rounds: usize,
+    ) -> Option<Solution<State>> {
+        for _ in 0..rounds {
+            let before = self.sigmas();
+            self.learn_deviations(&solution)?;
+            let state = solution.state.clone();
+            solution = minimize(self, state, search)?;
+            let moved = before.iter().zip(self.sigmas()).map(|(a, b): (&f64, f64)| (a / b).ln().abs());
+            if moved.fold(0.0, f64::max) < SETTLED {
+                break;
+            }
+        }
+        Some(solution)
+    }
+
+    /// A view's correction squared: what it is, and what it might be besides.
+    fn square(&self, solution: &Solution<State>, view: usize) -> Option<Matrix6<f64>> {
+        let at = self.common() + 6 * view;
+        let doubt: Matrix6<f64> = solution.covariance.as_ref()?.fixed_view::<6, 6>(at, at).into_owned();
+        let correction = solution.state.corrections.get(view)?;
+        Some(correction * correction.transpose() + doubt)
+    }
+
+    /// From here on, views far beyond the middle one are not heard, and errors of the others are normal.
+    fn leave_out_outliers(&mut self, solution: &Solution<State>) -> Option<()> {
+        let squares: Vec<[f64; 2]> = (0..self.views.len())
+            .map(|view| {
+                let square = self.square(solution, view)?;
+                Some([0, 3].map(|first| square.fixed_view::<3, 3>(first, first).trace()))
+            })
+            .collect::<Option<_>>()?;
+        let variance = |kind: usize| {
+            let mut sorted: Vec<f64> = squares.iter().map(|square| square[kind]).collect();
+            sorted.sort_by(f64::total_cmp);
+            let middle = sorted.get(sorted.len() / 2).copied().unwrap_or(0.0);
+            (middle / MIDDLE).max(LEAST_SIGMAS[kind] * LEAST_SIGMAS[kind])
+        };
+        let variances = [variance(0), variance(1)];
+        self.tail = None;
+        for (view, square) in squares.iter().enumerate() {
+            self.distance[view] = square[0] / variances[0] + square[1] / variances[1];
+            self.outlier[view] = self.distance[view] > DISTANT;
+            self.trust[view] = if self.outlier[view] { UNHEARD } else { 1.0 };
+        }
+        Some(())
+    }
+
     /// Deviations and trust from what the corrections turned out to be.
     fn learn_deviations(&mut self, solution: &Solution<State>) -> Option<()> {
-        let covariance = solution.covariance.as_ref()?;
         let common = self.common();
-        let (mut sum, mut held) = (Matrix6::zeros(), 0.0);
-        for (view, correction) in solution.state.corrections.iter().enumerate() {
-            let doubt: Matrix6<f64> = covariance
-                .fixed_view::<6, 6>(common + 6 * view, common + 6 * view)
-                .into_owned();
+        let (mut sum, mut held, mut views) = (Matrix6::zeros(), 0.0, 0);
+        for view in 0..self.views.len() {
+            let square = self.square(solution, view)?;
+            let correction = &solution.state.corrections[view];
+            let doubt = square - correction * correction.transpose();
             held += self.trust[view] * (self.spread.information * doubt).trace();
-            // What it is, and what it might be besides.
-            let square = correction * correction.transpose() + doubt;
-            self.trust[view] = (TAIL + 6.0) / (TAIL + (self.spread.information * square).trace());
+            if self.outlier[view] {
+                continue;
+            }
+            if let Some(tail) = self.tail {
+                self.trust[view] = (tail + 6.0) / (tail + (self.spread.information * square).trace());
+            }
             sum += self.trust[view] * square;
+            views += 1;
         }
-        self.spread = Spread::learnt(sum, self.views.len())?;
+        self.spread = Spread::learnt(sum, views)?;
         // A corner within Huber's width counts in full; the residuals of Gaussian noise lose as many squares as there are unknowns, and
         // of the corrections only as many are the picture's as the prior does not hold.
         let rest: f64 = (solution.residuals.rows(0, self.measured()).iter().enumerate())
@@ -305,7 +373,8 @@ impl Reprojection<'_> {
             },
             joint_offsets: joint_offsets.collect(),
             corrections: state.corrections.clone(),
-            trust: self.trust.clone(),
+            outlier: self.outlier.clone(),
+            distance: self.distance.clone(),
             sigmas: self.sigmas(),
             rms_px: (pixels / (measured / 2) as f64).sqrt(),
             predicted_px: (0..self.views.len()).map(|view| self.rms_of(&without, view)).collect(),
@@ -575,9 +644,9 @@ mod tests {
         recorded.hands[4] = shifted(&recorded.hands[4], &[4.0, -3.0, 2.0, 0.02, 0.0, -0.015]);
         let refined = recorded.refined(&Settings::default());
         assert!(
-            (0..12).all(|view| (refined.trust[view] < 0.15) == (view == 4)),
+            (0..12).all(|view| refined.outlier[view] == (view == 4)),
             "{:?}",
-            refined.trust
+            refined.distance
         );
         let moved = (refined.hand_from_camera.translation() - right.hand_from_camera.translation()).norm();
         assert!(

@@ -27,8 +27,6 @@ use crate::robot::pose_buffer::PoseBuffer;
 use crate::robot::trajectory::TumFile;
 use crate::time::{Span, Timestamp};
 
-/// A view trusted less than this is named as wrong: one of a thousand right ones is (χ² of six degrees above 22.5).
-const LITTLE_TRUST: f64 = 0.4;
 /// Corners that a view must show.
 const LEAST_CORNERS: usize = 6;
 
@@ -391,7 +389,9 @@ struct View {
     /// Correction of the hand: shift mm, turn degrees.
     correction_mm: f64,
     correction_deg: f64,
-    trust: f64,
+    /// Square of the correction in deviations that the middle station tells: about 6 for one like the others.
+    distance: f64,
+    /// Not heard: the arm was not where it said.
     wrong: bool,
     /// Predicted from a calibration on the others.
     left_out_px: Option<f64>,
@@ -450,8 +450,8 @@ impl Report {
                 predicted_px: refined.predicted_px[view],
                 correction_mm: refined.corrections[view].fixed_rows::<3>(0).norm(),
                 correction_deg: refined.corrections[view].fixed_rows::<3>(3).norm().to_degrees(),
-                trust: refined.trust[view].min(1.0),
-                wrong: refined.trust[view] < LITTLE_TRUST,
+                distance: refined.distance[view],
+                wrong: refined.outlier[view],
                 left_out_px: held[view].map(|held| held.rms_px),
                 left_out_mm: held[view].map(|held| held.board_mm),
             })
@@ -469,7 +469,7 @@ impl Report {
             .map(|view| view.name.clone())
             .collect();
         if !wrong.is_empty() {
-            warnings.push(format!("the arm was not where it said at {}", listed(&wrong)));
+            warnings.push(format!("the arm was not where it said at {}: not used", listed(&wrong)));
         }
         if views.len() < 8 {
             warnings.push(format!("only {} stations: ten to thirty make the answer sure", views.len()));
@@ -527,7 +527,7 @@ impl Report {
         );
         let _ = writeln!(
             text,
-            "\n  station                        corners  arm alone  correction        trust  left out"
+            "\n  station                        corners  arm alone  correction     distance  left out"
         );
         for view in &self.views {
             let held = match (view.left_out_px, view.left_out_mm) {
@@ -536,13 +536,13 @@ impl Report {
             };
             let _ = writeln!(
                 text,
-                "  {:<30} {:>7}  {:>6.2} px  {:.2} mm {:>6.3}°  {:>5.2}  {held}{}",
+                "  {:<30} {:>7}  {:>6.2} px  {:.2} mm {:>6.3}° {:>7.1}  {held}{}",
                 view.name,
                 view.corners,
                 view.predicted_px,
                 view.correction_mm,
                 view.correction_deg,
-                view.trust,
+                view.distance.sqrt(),
                 if view.wrong { "  WRONG" } else { "" }
             );
         }
