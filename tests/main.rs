@@ -16,6 +16,7 @@ mod config;
 mod determinism;
 mod feed;
 mod feed_fuzz;
+mod hand_eye;
 mod import;
 mod light_field;
 mod media;

@@ -5,4 +5,5 @@ pub mod camera;
 pub mod error;
 pub mod hand_eye;
 pub mod homography;
+pub mod pivot;
 pub mod time_offset;

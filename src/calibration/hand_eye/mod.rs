@@ -17,6 +17,7 @@ pub mod dual_quaternion;
 pub mod example;
 pub mod method;
 pub mod motion;
+pub mod plot;
 pub mod refinement;
 pub mod robot_world;
 pub mod rotation_first;

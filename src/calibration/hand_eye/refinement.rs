@@ -620,7 +620,16 @@ mod tests {
 
     #[test]
     fn with_noisy_joints_the_truth_lies_within_three_stated_deviations() {
-        let runs = 40;
+        covered(40);
+    }
+
+    #[test]
+    #[ignore = "a minute"]
+    fn with_noisy_joints_the_truth_lies_within_three_stated_deviations_two_hundred_times() {
+        covered(200);
+    }
+
+    fn covered(runs: u64) {
         let (mut inside, mut square) = (0, 0.0);
         for seed in 0..runs {
             let recorded = recorded(100 + seed, 20, 0.05_f64.to_radians());

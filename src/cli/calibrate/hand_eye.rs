@@ -1,30 +1,29 @@
 //! `calibrate hand-eye`: how the camera sits on the arm, from a board seen from many stations.
 
-use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use anyhow::Context as _;
-use nalgebra::Matrix4;
-use serde::Serialize;
 
 use crate::calibration::board::detection::{Detection, detect};
 use crate::calibration::board::pattern::BoardLayout;
 use crate::calibration::camera::pose::board_pose;
-use crate::calibration::hand_eye::calibrate::{Held, StationView, calibrate, leave_out, stations};
-use crate::calibration::hand_eye::method::METHODS;
+use crate::calibration::hand_eye::calibrate::{StationView, calibrate};
+use crate::calibration::hand_eye::plot::{self, Drawn};
 use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings, Sighting};
 use crate::camera::file;
 use crate::camera::model::CameraModel;
+use crate::cli::calibrate::hand_eye_report::{Report, listed};
 use crate::cli::calibrate::pictures::{Seen, look_at_all};
+use crate::cli::calibrate::pose_files;
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
 use crate::geometry::space::{Hand, RobotBase};
 use crate::geometry::transform::Transform;
+use crate::media::image_files;
 use crate::recording::folder::Recording;
 use crate::robot::hand_eye::HandEye;
 use crate::robot::kinematics::{Arm, JointSample};
 use crate::robot::pose_buffer::PoseBuffer;
-use crate::robot::trajectory::TumFile;
 use crate::time::{Span, Timestamp};
 
 /// Corners that a view must show.
@@ -78,8 +77,8 @@ pub struct Args {
 /// Run it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let layout = BoardLayout::new(&args.board, args.square_mm).map_err(|error| UsageError(error.to_string()))?;
-    let report_path = super::beside(&args.output, "_report.json");
-    for path in [&args.output, &report_path] {
+    let [report_path, plot_path] = ["_report.json", "_report.png"].map(|ending| super::beside(&args.output, ending));
+    for path in [&args.output, &report_path, &plot_path] {
         context.refuse_overwriting(path)?;
     }
     let recorded = args.recording.as_deref().map(Recording::open).transpose()?;
@@ -125,8 +124,15 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     };
     hand_eye.write(&args.output)?;
     super::write_json(&report_path, &serde_json::to_value(&report)?)?;
+    let drawn = drawn(&refined, &views, &hands, &camera, &report);
+    image_files::write(&plot_path, &plot::drawn((camera.width, camera.height), &drawn))?;
     console::print(&report.table())?;
-    console::print(&format!("\nwrote {} and {}\n", args.output.display(), report_path.display()))?;
+    console::print(&format!(
+        "\nwrote {}, {} and {}\n",
+        args.output.display(),
+        report_path.display(),
+        plot_path.display()
+    ))?;
     Ok(Ended::Complete)
 }
 
@@ -237,7 +243,7 @@ fn of_recording(
     seen: &[Seen<Option<Detection>>],
     context: &Context,
 ) -> anyhow::Result<Hands> {
-    let folder = args.recording.as_deref().unwrap_or(Path::new("."));
+    let folder = args.recording.as_deref().unwrap_or(std::path::Path::new("."));
     let times = recording.frame_times.as_ref().with_context(|| {
         format!(
             "{}: expected frames.csv with each frame's exposure time on the arm's clock, found none",
@@ -285,16 +291,9 @@ fn of_files(args: &Args, pictures: usize) -> anyhow::Result<Hands> {
     ))
 }
 
-/// One pose a picture, from as many matrices or from one TUM file.
+/// One pose a picture.
 fn poses<To, From>(files: &[PathBuf], pictures: usize, option: &str) -> anyhow::Result<Vec<Transform<To, From>>> {
-    let of_tum = |path: &Path| -> anyhow::Result<Vec<Transform<To, From>>> {
-        let file = TumFile::read(path)?;
-        Ok(file.poses.iter().map(|(_, pose)| Transform::from_isometry(*pose)).collect())
-    };
-    let found = match files {
-        [one] if one.extension().is_some_and(|ending| ending == "tum") => of_tum(one)?,
-        files => files.iter().map(|path| matrix(path)).collect::<anyhow::Result<_>>()?,
-    };
+    let found: Vec<_> = pose_files::read(files)?.into_iter().map(|(_, pose)| pose).collect();
     if found.len() != pictures {
         return Err(UsageError(format!(
             "{option}: expected a pose for each of {pictures} pictures, found {}",
@@ -303,32 +302,6 @@ fn poses<To, From>(files: &[PathBuf], pictures: usize, option: &str) -> anyhow::
         .into());
     }
     Ok(found)
-}
-
-/// A pose as sixteen numbers, row by row.
-fn matrix<To, From>(path: &Path) -> anyhow::Result<Transform<To, From>> {
-    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let numbers: Vec<f64> = (text.split(|c: char| c.is_whitespace() || c == ',' || c == ';'))
-        .filter_map(|word| word.parse().ok())
-        .collect();
-    anyhow::ensure!(
-        numbers.len() == 16 && numbers.iter().all(|n| n.is_finite()),
-        "{}: expected a 4×4 matrix (16 numbers), found {} numbers",
-        path.display(),
-        numbers.len()
-    );
-    let matrix = Matrix4::from_row_slice(&numbers);
-    let rotation = matrix.fixed_view::<3, 3>(0, 0).into_owned();
-    anyhow::ensure!(
-        (rotation * rotation.transpose() - nalgebra::Matrix3::identity()).norm() < 0.01 && rotation.determinant() > 0.0,
-        "{}: expected a rotation in the matrix's upper left, found none (determinant {:.3})",
-        path.display(),
-        rotation.determinant()
-    );
-    Ok(Transform::from_matrix(
-        &rotation,
-        matrix.fixed_view::<3, 1>(0, 3).into_owned(),
-    ))
 }
 
 /// Pictures with a board and a hand, their names, and the rest with the reason.
@@ -370,225 +343,28 @@ fn matched(
     (views, hands.kept(&kept), names, without)
 }
 
-fn listed(names: &[String]) -> String {
-    const MOST: usize = 4;
-    let shown = names.iter().take(MOST).cloned().collect::<Vec<_>>().join(", ");
-    if names.len() > MOST {
-        format!("{shown} and {} more", names.len() - MOST)
+/// What each view saw, and where the arm alone puts it.
+fn drawn(refined: &Refined, views: &[StationView], hands: &Hands, camera: &CameraModel, report: &Report) -> Vec<Drawn> {
+    let offsets: Vec<f64> = refined.joint_offsets.iter().map(|offset| offset[0]).collect();
+    let offsets = if offsets.is_empty() {
+        vec![0.0; hands.joints()]
     } else {
-        shown
-    }
-}
-
-#[derive(Debug, Serialize)]
-struct View {
-    name: String,
-    corners: usize,
-    /// What the arm alone predicts, RMS px.
-    predicted_px: f64,
-    /// Correction of the hand: shift mm, turn degrees.
-    correction_mm: f64,
-    correction_deg: f64,
-    /// Square of the correction in deviations that the middle station tells: about 6 for one like the others.
-    distance: f64,
-    /// Not heard: the arm was not where it said.
-    wrong: bool,
-    /// Predicted from a calibration on the others.
-    left_out_px: Option<f64>,
-    left_out_mm: Option<f64>,
-}
-
-#[derive(Debug, Serialize)]
-struct Compared {
-    method: &'static str,
-    /// Difference to the joint refinement.
-    off_mm: Option<f64>,
-    off_deg: Option<f64>,
-    /// Mean and median over views left out.
-    left_out_px: Option<[f64; 2]>,
-    left_out_mm: Option<[f64; 2]>,
-}
-
-#[derive(Debug, Serialize)]
-struct Report {
-    version: &'static str,
-    translation_mm: [f64; 3],
-    rotation_xyzw: [f64; 4],
-    sigma_mm: [f64; 3],
-    sigma_deg: [f64; 3],
-    base_from_board_mm: [f64; 3],
-    rms_px: f64,
-    arm_sigma_mm: f64,
-    arm_sigma_deg: f64,
-    corner_sigma_px: f64,
-    time_offset_ms: Option<[f64; 2]>,
-    joint_offsets: Vec<[f64; 2]>,
-    views: Vec<View>,
-    methods: Vec<Compared>,
-    left_out_pictures: Vec<String>,
-    warnings: Vec<String>,
-}
-
-impl Report {
-    fn new(
-        refined: &Refined,
-        views: &[StationView],
-        hands: &Hands,
-        camera: &CameraModel,
-        settings: &Settings,
-        names: &[String],
-        left_out_pictures: Vec<String>,
-    ) -> Self {
-        let held = leave_out(views, hands, camera, settings, None);
-        let x = refined.hand_from_camera;
-        let q = x.rotation();
-        let deviation = |i: usize| refined.covariance[(i, i)].max(0.0).sqrt();
-        let reports: Vec<View> = (names.iter().enumerate())
-            .map(|(view, name)| View {
-                name: name.clone(),
-                corners: views[view].sightings.len(),
-                predicted_px: refined.predicted_px[view],
-                correction_mm: refined.corrections[view].fixed_rows::<3>(0).norm(),
-                correction_deg: refined.corrections[view].fixed_rows::<3>(3).norm().to_degrees(),
-                distance: refined.distance[view],
-                wrong: refined.outlier[view],
-                left_out_px: held[view].map(|held| held.rms_px),
-                left_out_mm: held[view].map(|held| held.board_mm),
-            })
-            .collect();
-        let stations = stations(views, hands);
-        let mut methods: Vec<Compared> = vec![compared("joint refinement", Some(x), &x, &held)];
-        methods.extend(METHODS.iter().map(|&method| {
-            let held = leave_out(views, hands, camera, settings, Some(method));
-            compared(method.name(), method.solve(&stations), &x, &held)
-        }));
-        let mut warnings = Vec::new();
-        let wrong: Vec<String> = reports
-            .iter()
-            .filter(|view| view.wrong)
-            .map(|view| view.name.clone())
-            .collect();
-        if !wrong.is_empty() {
-            warnings.push(format!("the arm was not where it said at {}: not used", listed(&wrong)));
-        }
-        if views.len() < 8 {
-            warnings.push(format!("only {} stations: ten to thirty make the answer sure", views.len()));
-        }
-        if (0..3).any(|axis| deviation(axis) > 1.0) {
-            warnings
-                .push("the camera's place is unsure by more than 1 mm: add stations, tilted farther and about other axes".into());
-        }
-        Self {
-            version: env!("CARGO_PKG_VERSION"),
-            translation_mm: x.translation().into(),
-            rotation_xyzw: [q.i, q.j, q.k, q.w],
-            sigma_mm: std::array::from_fn(deviation),
-            sigma_deg: std::array::from_fn(|axis| deviation(axis + 3).to_degrees()),
-            base_from_board_mm: refined.base_from_board.translation().into(),
-            rms_px: refined.rms_px,
-            arm_sigma_mm: refined.sigmas[0],
-            arm_sigma_deg: refined.sigmas[1].to_degrees(),
-            corner_sigma_px: refined.sigmas[2],
-            time_offset_ms: settings.time_offset.then(|| refined.time_offset_s.map(|s| 1000.0 * s)),
-            joint_offsets: refined.joint_offsets.clone(),
-            views: reports,
-            methods,
-            left_out_pictures,
-            warnings,
-        }
-    }
-
-    fn table(&self) -> String {
-        let mut text = String::new();
-        let [x, y, z] = self.translation_mm;
-        let [sx, sy, sz] = self.sigma_mm;
-        let [rx, ry, rz] = self.sigma_deg;
-        // Writing to a String cannot fail.
-        let _ = writeln!(text, "hand_from_camera, {} stations", self.views.len());
-        let _ = writeln!(text, "  translation   {x:.3} {y:.3} {z:.3} mm  (± {sx:.3} {sy:.3} {sz:.3})");
-        let [qx, qy, qz, qw] = self.rotation_xyzw;
-        let _ = writeln!(
-            text,
-            "  rotation      {qx:.5} {qy:.5} {qz:.5} {qw:.5} xyzw  (± {rx:.3} {ry:.3} {rz:.3}°)"
-        );
-        if let Some([offset, sigma]) = self.time_offset_ms {
-            let _ = writeln!(
-                text,
-                "  time offset   {offset:.1} ms  (± {sigma:.1}), added to the arm's stamps"
-            );
-        }
-        for (joint, [offset, sigma]) in self.joint_offsets.iter().enumerate() {
-            let _ = writeln!(text, "  joint {}       {offset:.5} (± {sigma:.5}) mm or rad", joint + 1);
-        }
-        let _ = writeln!(
-            text,
-            "  arm's noise   {:.3} mm, {:.4}° a station; corners {:.3} px; RMS {:.3} px with the stations corrected",
-            self.arm_sigma_mm, self.arm_sigma_deg, self.corner_sigma_px, self.rms_px
-        );
-        let _ = writeln!(
-            text,
-            "\n  station                        corners  arm alone  correction     distance  left out"
-        );
-        for view in &self.views {
-            let held = match (view.left_out_px, view.left_out_mm) {
-                (Some(px), Some(mm)) => format!("{px:.2} px {mm:.2} mm"),
-                _ => "–".to_owned(),
-            };
-            let _ = writeln!(
-                text,
-                "  {:<30} {:>7}  {:>6.2} px  {:.2} mm {:>6.3}° {:>7.1}  {held}{}",
-                view.name,
-                view.corners,
-                view.predicted_px,
-                view.correction_mm,
-                view.correction_deg,
-                view.distance.sqrt(),
-                if view.wrong { "  WRONG" } else { "" }
-            );
-        }
-        let _ = writeln!(
-            text,
-            "\n  method             differs by           stations left out, mean (median)"
-        );
-        for method in &self.methods {
-            let off = match (method.off_mm, method.off_deg) {
-                (Some(mm), Some(deg)) => format!("{mm:.3} mm {deg:.3}°"),
-                _ => "no answer".to_owned(),
-            };
-            let held = match (method.left_out_px, method.left_out_mm) {
-                (Some([px, middle_px]), Some([mm, middle_mm])) => {
-                    format!("{px:.3} ({middle_px:.3}) px {mm:.3} ({middle_mm:.3}) mm")
-                }
-                _ => "–".to_owned(),
-            };
-            let _ = writeln!(text, "  {:<18} {off:<20} {held}", method.method);
-        }
-        for warning in &self.warnings {
-            let _ = writeln!(text, "  ! {warning}");
-        }
-        text
-    }
-}
-
-fn compared(
-    method: &'static str,
-    found: Option<Transform<Hand, crate::geometry::space::Camera>>,
-    reference: &Transform<Hand, crate::geometry::space::Camera>,
-    held: &[Option<Held>],
-) -> Compared {
-    let summed = |of: &dyn Fn(&Held) -> f64| {
-        let values: Option<Vec<f64>> = held.iter().map(|held| held.as_ref().map(of)).collect();
-        let mut values = values.filter(|values| !values.is_empty())?;
-        values.sort_by(f64::total_cmp);
-        let middle = values.len() / 2;
-        let median = 0.5 * (values[middle] + values[(values.len() - 1) / 2]);
-        Some([values.iter().sum::<f64>() / values.len() as f64, median])
+        offsets
     };
-    Compared {
-        method,
-        off_mm: found.map(|found| (found.translation() - reference.translation()).norm()),
-        off_deg: found.map(|found| found.rotation().angle_to(&reference.rotation()).to_degrees()),
-        left_out_px: summed(&|held| held.rms_px),
-        left_out_mm: summed(&|held| held.board_mm),
-    }
+    (views.iter().zip(&report.views).enumerate())
+        .map(|(view, (seen, told))| {
+            let hand = hands.base_from_hand(view, refined.time_offset_s[0], &offsets);
+            let camera_from_board = hand.map(|hand| (hand * refined.hand_from_camera).inverse() * refined.base_from_board);
+            let corners = seen.sightings.iter().map(|sighting| {
+                let predicted = camera_from_board.and_then(|pose| camera.project(pose * sighting.corner));
+                (sighting.pixel, predicted)
+            });
+            Drawn {
+                corners: corners.collect(),
+                predicted_px: told.predicted_px,
+                left_out_px: told.left_out_px,
+                outlier: told.wrong,
+            }
+        })
+        .collect()
 }

@@ -2,7 +2,10 @@
 
 pub mod camera;
 pub mod hand_eye;
+pub mod hand_eye_report;
 pub mod pictures;
+pub mod pivot;
+pub mod pose_files;
 pub mod time_offset;
 
 use std::path::{Path, PathBuf};
@@ -17,7 +20,8 @@ use crate::cli::context::{Context, Ended};
 #[command(
     after_help = "Examples:\n  endofield calibrate camera pictures/ --board checkerboard:9x6 --square-mm 4 -o camera.yaml
   endofield calibrate hand-eye stations/ --camera camera.yaml --board checkerboard:9x6 --square-mm 4
-  endofield calibrate time-offset survey/"
+  endofield calibrate time-offset survey/
+  endofield calibrate pivot pointer/*.txt"
 )]
 pub struct Args {
     #[command(subcommand)]
@@ -29,6 +33,7 @@ enum Subject {
     Camera(camera::Args),
     HandEye(hand_eye::Args),
     TimeOffset(time_offset::Args),
+    Pivot(pivot::Args),
 }
 
 /// Run it.
@@ -37,6 +42,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         Subject::Camera(args) => camera::run(args, context),
         Subject::HandEye(args) => hand_eye::run(args, context),
         Subject::TimeOffset(args) => time_offset::run(args, context),
+        Subject::Pivot(args) => pivot::run(args, context),
     }
 }
 
