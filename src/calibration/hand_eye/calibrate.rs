@@ -1,6 +1,7 @@
 //! The whole hand-eye calibration: checked, agreed upon, refined, and tried on views it has not seen.
 
 use nalgebra::Vector3;
+use rayon::prelude::*;
 
 use crate::calibration::hand_eye::consensus::agreement;
 use crate::calibration::hand_eye::method::Method;
@@ -110,17 +111,21 @@ pub fn leave_out(
     method: Option<Method>,
 ) -> Vec<Option<Held>> {
     let folds = views.len().min(MOST_FOLDS);
-    let mut held = vec![None; views.len()];
-    for fold in 0..folds {
+    let of_fold = |fold: usize| -> Vec<(usize, Held)> {
         let (left_out, numbers): (Vec<usize>, Vec<usize>) = (0..views.len()).partition(|view| view % folds == fold);
         let rest: Vec<StationView> = numbers.iter().map(|&view| views[view].clone()).collect();
         let Some((x, z, offset_s, offsets)) = calibrated(&rest, &Chosen { all: hands, numbers }, camera, settings, method) else {
-            continue;
+            return Vec::new();
         };
-        for view in left_out {
-            let hand = hands.base_from_hand(view, offset_s, &offsets);
-            held[view] = hand.and_then(|hand| predicted(&views[view], camera, (hand * x).inverse() * z));
-        }
+        let predicted = |view: usize| {
+            let hand = hands.base_from_hand(view, offset_s, &offsets)?;
+            Some((view, predicted(&views[view], camera, (hand * x).inverse() * z)?))
+        };
+        left_out.into_iter().filter_map(predicted).collect()
+    };
+    let mut held = vec![None; views.len()];
+    for (view, told) in (0..folds).into_par_iter().flat_map_iter(of_fold).collect::<Vec<_>>() {
+        held[view] = Some(told);
     }
     held
 }

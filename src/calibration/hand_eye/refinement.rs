@@ -137,6 +137,7 @@ pub fn refine(
     }
     let joints = hands.joints().min(settings.joint_sigma.len());
     let state = State {
+        told: told(hands, views.len(), 0.0, &vec![0.0; joints]),
         hand_from_camera,
         base_from_board,
         time_offset_s: 0.0,
@@ -172,11 +173,17 @@ pub fn refine(
 
 #[derive(Clone, Debug)]
 struct State {
+    /// Where the arm puts the hand at each view, at the time and joint offsets below.
+    told: Vec<Option<Transform<RobotBase, Hand>>>,
     hand_from_camera: Transform<Hand, Camera>,
     base_from_board: Transform<RobotBase, Board>,
     time_offset_s: f64,
     joints: Vec<f64>,
     corrections: Vec<Vector6<f64>>,
+}
+
+fn told(hands: &dyn HandPoses, views: usize, offset_s: f64, offsets: &[f64]) -> Vec<Option<Transform<RobotBase, Hand>>> {
+    (0..views).map(|view| hands.base_from_hand(view, offset_s, offsets)).collect()
 }
 
 struct Reprojection<'a> {
@@ -246,7 +253,7 @@ impl Reprojection<'_> {
 
     /// Where the camera was at a view.
     fn eye(&self, state: &State, view: usize) -> Option<Transform<RobotBase, Camera>> {
-        let told = self.hands.base_from_hand(view, state.time_offset_s, &state.joints)?;
+        let told = state.told.get(view).copied()??;
         let correction: Transform<Camera, Camera> = shifted(&Transform::identity(), state.corrections[view].as_slice());
         Some(told * state.hand_from_camera * correction)
     }
@@ -271,17 +278,22 @@ impl Reprojection<'_> {
         search: &least_squares::Settings,
         rounds: usize,
     ) -> Option<Solution<State>> {
+        // Until the deviations are found a few steps suffice.
+        let few = least_squares::Settings {
+            max_iterations: 8,
+            ..*search
+        };
         for _ in 0..rounds {
             let before = self.sigmas();
             self.learn_deviations(&solution)?;
             let state = solution.state.clone();
-            solution = minimize(self, state, search)?;
+            solution = minimize(self, state, &few)?;
             let moved = before.iter().zip(self.sigmas()).map(|(a, b): (&f64, f64)| (a / b).ln().abs());
             if moved.fold(0.0, f64::max) < SETTLED {
                 break;
             }
         }
-        Some(solution)
+        minimize(self, solution.state, search)
     }
 
     /// A view's correction squared: what it is, and what it might be besides.
@@ -446,16 +458,22 @@ impl Problem for Reprojection<'_> {
     fn moved(&self, state: &State, step: &[f64]) -> State {
         let common = self.common();
         let first_joint = POSES + usize::from(self.time_offset);
+        let time_offset_s = state.time_offset_s + if self.time_offset { step[POSES] } else { 0.0 };
+        let joints: Vec<f64> = (state.joints.iter().zip(&step[first_joint..]))
+            .map(|(joint, step)| joint + step)
+            .collect();
+        // Asking the arm costs more than all the rest.
+        let told = if step[POSES..common].iter().all(|step| *step == 0.0) {
+            state.told.clone()
+        } else {
+            told(self.hands, self.views.len(), time_offset_s, &joints)
+        };
         State {
+            told,
             hand_from_camera: shifted(&state.hand_from_camera, &step[..6]),
             base_from_board: shifted(&state.base_from_board, &step[6..POSES]),
-            time_offset_s: state.time_offset_s + if self.time_offset { step[POSES] } else { 0.0 },
-            joints: state
-                .joints
-                .iter()
-                .zip(&step[first_joint..])
-                .map(|(joint, step)| joint + step)
-                .collect(),
+            time_offset_s,
+            joints,
             corrections: (state.corrections.iter().zip(step[common..].chunks(6)))
                 .map(|(correction, step)| correction + Vector6::from_column_slice(step))
                 .collect(),

@@ -75,7 +75,14 @@ impl Report {
         names: &[String],
         left_out_pictures: Vec<String>,
     ) -> Self {
-        let held = leave_out(views, hands, camera, settings, None);
+        // The search for deviations begins where that of all views ended; it ends where the fold's own views lead it.
+        let begun = Settings {
+            place_sigma_mm: refined.sigmas[0],
+            turn_sigma_rad: refined.sigmas[1],
+            pixel_sigma: refined.sigmas[2],
+            ..settings.clone()
+        };
+        let held = leave_out(views, hands, camera, &begun, None);
         let x = refined.hand_from_camera;
         let q = x.rotation();
         let deviation = |i: usize| refined.covariance[(i, i)].max(0.0).sqrt();
