@@ -9,12 +9,16 @@
 //! 3. [`consensus`]: stations that contradict the rest are found;
 //! 4. [`refinement`]: X, Z and whatever else is unknown, where the board is seen again, with priors and covariance;
 //! 5. [`calibrate`]: all of it, and tried on views left out.
+//!
+//! Without a board, tracks of any still scene ([`feature_tracks`]) tell X by their [`epipolar`] constraint.
 
 pub mod calibrate;
 pub mod consensus;
 pub mod dual_quaternion;
+pub mod epipolar;
 #[cfg(test)]
 pub mod example;
+pub mod feature_tracks;
 pub mod method;
 pub mod motion;
 pub mod plot;

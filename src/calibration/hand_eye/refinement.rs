@@ -507,7 +507,7 @@ impl Problem for Reprojection<'_> {
 
 /// A pose whose origin is moved by the first three numbers (mm), and that is turned about it by the rotation vector of the others (rad),
 /// both in the space it leads to.
-fn shifted<To, From>(pose: &Transform<To, From>, by: &[f64]) -> Transform<To, From> {
+pub(crate) fn shifted<To, From>(pose: &Transform<To, From>, by: &[f64]) -> Transform<To, From> {
     let turn = UnitQuaternion::from_scaled_axis(Vector3::new(by[3], by[4], by[5]));
     Transform::new(turn * pose.rotation(), pose.translation() + Vector3::new(by[0], by[1], by[2]))
 }

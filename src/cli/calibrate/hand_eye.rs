@@ -2,8 +2,6 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context as _;
-
 use crate::calibration::board::detection::{Detection, detect};
 use crate::calibration::board::pattern::BoardLayout;
 use crate::calibration::camera::pose::board_pose;
@@ -13,6 +11,8 @@ use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings, Sig
 use crate::camera::file;
 use crate::camera::model::CameraModel;
 use crate::cli::calibrate::hand_eye_report::{Report, listed};
+use crate::cli::calibrate::hand_eye_scene;
+use crate::cli::calibrate::hands::{Hands, joint_sigmas};
 use crate::cli::calibrate::pictures::{Seen, look_at_all};
 use crate::cli::calibrate::pose_files;
 use crate::cli::console;
@@ -22,9 +22,7 @@ use crate::geometry::transform::Transform;
 use crate::media::image_files;
 use crate::recording::folder::Recording;
 use crate::robot::hand_eye::HandEye;
-use crate::robot::kinematics::{Arm, JointSample};
-use crate::robot::pose_buffer::PoseBuffer;
-use crate::time::{Span, Timestamp};
+use crate::time::Span;
 
 /// Corners that a view must show.
 const LEAST_CORNERS: usize = 6;
@@ -33,15 +31,17 @@ const LEAST_CORNERS: usize = 6;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   endofield calibrate hand-eye stations/ --camera camera.yaml --board checkerboard:9x6 --square-mm 4
+  endofield calibrate hand-eye survey/
   endofield calibrate hand-eye --images left_*.png --poses hand_*.txt --board-poses board_*.txt \\
       --camera camera.yaml --board checkerboard:13x8 --square-mm 3 -o hand_eye.yaml
 
 Rest the arm at ten to thirty stations before a board that lies still; tilt the scope by 20° and more to all sides and roll it.
-Beside hand_eye.yaml is written hand_eye_report.json.")]
+Without a board, a survey of any still scene with texture will do; the answer is less sure.
+Beside hand_eye.yaml are written hand_eye_report.json and hand_eye_report.png.")]
 pub struct Args {
     /// A recording: pictures, frames.csv, and poses.tum or joints.csv.
     #[arg(required_unless_present = "images", conflicts_with = "images")]
-    recording: Option<PathBuf>,
+    pub(super) recording: Option<PathBuf>,
     /// Pictures, one a station, in place of a recording.
     #[arg(long, num_args = 1.., value_name = "FILE", requires = "poses")]
     images: Vec<PathBuf>,
@@ -53,30 +53,33 @@ pub struct Args {
     board_poses: Vec<PathBuf>,
     /// The camera; a recording's own if left out.
     #[arg(long, value_name = "FILE")]
-    camera: Option<PathBuf>,
-    /// The board, such as checkerboard:9x6 (as in calibrate camera).
-    #[arg(long)]
-    board: String,
+    pub(super) camera: Option<PathBuf>,
+    /// The board, such as checkerboard:9x6 (as in calibrate camera); without it, the recording's own scene must do, and be still.
+    #[arg(long, requires = "square_mm", required_unless_present = "recording")]
+    board: Option<String>,
     /// Side of a square or distance of dots, mm.
-    #[arg(long, value_name = "MM")]
-    square_mm: f64,
+    #[arg(long, value_name = "MM", requires = "board")]
+    square_mm: Option<f64>,
     /// Frames looked at, of a recording.
     #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u32).range(3..=200))]
-    frames: u32,
+    pub(super) frames: u32,
     /// The arm's kinematics, to read joints.csv with; with it constant joint offsets can be found.
     #[arg(long, value_name = "FILE")]
-    arm: Option<PathBuf>,
+    pub(super) arm: Option<PathBuf>,
     /// How far joints may be off constantly, degrees (mm for a slide at ten times the number); 0 does not look for offsets.
     #[arg(long, value_name = "DEG", default_value_t = 0.0)]
     joint_offsets_deg: f64,
     /// Hand-eye file to write.
     #[arg(short, long, default_value = "hand_eye.yaml", value_name = "FILE")]
-    output: PathBuf,
+    pub(super) output: PathBuf,
 }
 
 /// Run it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
-    let layout = BoardLayout::new(&args.board, args.square_mm).map_err(|error| UsageError(error.to_string()))?;
+    let (Some(board), Some(square_mm)) = (&args.board, args.square_mm) else {
+        return hand_eye_scene::run(args, context);
+    };
+    let layout = BoardLayout::new(board, square_mm).map_err(|error| UsageError(error.to_string()))?;
     let [report_path, plot_path] = ["_report.json", "_report.png"].map(|ending| super::beside(&args.output, ending));
     for path in [&args.output, &report_path, &plot_path] {
         context.refuse_overwriting(path)?;
@@ -98,7 +101,11 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         );
     }
     let arm = match &recorded {
-        Some(recording) => of_recording(args, recording, &seen, context)?,
+        Some(recording) => {
+            let folder = args.recording.as_deref().unwrap_or(std::path::Path::new("."));
+            let frames: Vec<u64> = seen.iter().map(|seen| seen.frame).collect();
+            Hands::of_recording((folder, recording), args.arm.as_deref(), &frames, context)?
+        }
         None => of_files(args, seen.len())?,
     };
     let (views, hands, names, without) = matched(&seen, &camera, arm);
@@ -136,7 +143,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     Ok(Ended::Complete)
 }
 
-fn camera_of(args: &Args, recording: Option<&Recording>) -> anyhow::Result<CameraModel> {
+pub(super) fn camera_of(args: &Args, recording: Option<&Recording>) -> anyhow::Result<CameraModel> {
     match (&args.camera, recording.and_then(|recording| recording.camera.clone())) {
         (Some(path), _) => Ok(file::read(path)?),
         (None, Some(camera)) => Ok(camera),
@@ -145,135 +152,6 @@ fn camera_of(args: &Args, recording: Option<&Recording>) -> anyhow::Result<Camer
         )
         .into()),
     }
-}
-
-/// Where the hand was at each picture.
-#[derive(Debug)]
-enum Hands {
-    /// As told, one a picture.
-    Told(Vec<Transform<RobotBase, Hand>>),
-    /// Read from the arm's path when the picture was exposed.
-    Timed { arm: PoseBuffer, instants: Vec<Timestamp> },
-    /// Read from joint values.
-    Jointed {
-        arm: Arm,
-        samples: Vec<JointSample>,
-        instants: Vec<Timestamp>,
-    },
-}
-
-impl Hands {
-    /// Only these pictures.
-    fn kept(self, pictures: &[usize]) -> Self {
-        let of = |instants: Vec<Timestamp>| pictures.iter().map(|&picture| instants[picture]).collect();
-        match self {
-            Self::Told(poses) => Self::Told(pictures.iter().map(|&picture| poses[picture]).collect()),
-            Self::Timed { arm, instants } => Self::Timed {
-                arm,
-                instants: of(instants),
-            },
-            Self::Jointed { arm, samples, instants } => Self::Jointed {
-                arm,
-                samples,
-                instants: of(instants),
-            },
-        }
-    }
-}
-
-impl HandPoses for Hands {
-    fn base_from_hand(&self, view: usize, offset_s: f64, offsets: &[f64]) -> Option<Transform<RobotBase, Hand>> {
-        let offset = Span::from_seconds(offset_s);
-        match self {
-            Self::Told(poses) => poses.get(view).copied(),
-            Self::Timed { arm, instants } => arm
-                .pose_at(*instants.get(view)? - offset)
-                .ok()
-                .map(|found| found.base_from_hand),
-            Self::Jointed { arm, samples, instants } => {
-                let mut values = joints_at(samples, *instants.get(view)? - offset)?;
-                for (value, offset) in values.iter_mut().zip(offsets) {
-                    *value += offset;
-                }
-                arm.base_from_hand(&values).ok()
-            }
-        }
-    }
-
-    fn joints(&self) -> usize {
-        match self {
-            Self::Jointed { arm, .. } => arm.joints().len(),
-            _ => 0,
-        }
-    }
-}
-
-/// Joint values between two samples.
-fn joints_at(samples: &[JointSample], at: Timestamp) -> Option<Vec<f64>> {
-    let after = samples.partition_point(|sample| sample.stamp <= at);
-    let before = samples.get(after.checked_sub(1)?)?;
-    let Some(next) = samples.get(after) else {
-        return (before.stamp == at).then(|| before.values.clone());
-    };
-    let t = (at - before.stamp).seconds() / (next.stamp - before.stamp).seconds();
-    Some(
-        (before.values.iter().zip(&next.values))
-            .map(|(a, b)| a + t * (b - a))
-            .collect(),
-    )
-}
-
-/// Standard deviations of joint offsets: none if they are not looked for.
-fn joint_sigmas(hands: &Hands, degrees: f64) -> Vec<f64> {
-    use crate::robot::kinematics::JointKind;
-    match hands {
-        Hands::Jointed { arm, .. } if degrees > 0.0 => (arm.joints().iter())
-            .map(|joint| match joint.kind {
-                JointKind::Prismatic => 10.0 * degrees,
-                JointKind::Revolute => degrees.to_radians(),
-            })
-            .collect(),
-        _ => Vec::new(),
-    }
-}
-
-fn of_recording(
-    args: &Args,
-    recording: &Recording,
-    seen: &[Seen<Option<Detection>>],
-    context: &Context,
-) -> anyhow::Result<Hands> {
-    let folder = args.recording.as_deref().unwrap_or(std::path::Path::new("."));
-    let times = recording.frame_times.as_ref().with_context(|| {
-        format!(
-            "{}: expected frames.csv with each frame's exposure time on the arm's clock, found none",
-            folder.display()
-        )
-    })?;
-    let instants = seen
-        .iter()
-        .map(|seen| {
-            let number = usize::try_from(seen.frame).unwrap_or(usize::MAX);
-            times
-                .get(number)
-                .copied()
-                .with_context(|| format!("frames.csv: no line for frame {}", seen.frame))
-        })
-        .collect::<anyhow::Result<Vec<Timestamp>>>()?;
-    let joints = folder.join("joints.csv");
-    if let Some(path) = &args.arm {
-        let arm = Arm::read(path)?;
-        let samples = arm.read_joint_samples(&joints)?;
-        return Ok(Hands::Jointed { arm, samples, instants });
-    }
-    let trajectory = recording
-        .trajectory
-        .as_ref()
-        .with_context(|| format!("{}: expected poses.tum or joints.csv, found none", folder.display()))?;
-    Ok(Hands::Timed {
-        arm: PoseBuffer::from_trajectory(trajectory, &context.config.poses)?,
-        instants,
-    })
 }
 
 fn of_files(args: &Args, pictures: usize) -> anyhow::Result<Hands> {

@@ -3,6 +3,8 @@
 pub mod camera;
 pub mod hand_eye;
 pub mod hand_eye_report;
+pub mod hand_eye_scene;
+pub mod hands;
 pub mod pictures;
 pub mod pivot;
 pub mod pose_files;
