@@ -8,6 +8,7 @@
 
 mod architecture;
 mod bad_input;
+mod calibrate_color;
 mod calibration;
 mod camera;
 mod cli;

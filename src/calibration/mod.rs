@@ -2,6 +2,7 @@
 
 pub mod board;
 pub mod camera;
+pub mod color;
 pub mod error;
 pub mod hand_eye;
 pub mod homography;

@@ -158,7 +158,11 @@ mod tests {
             ..correction.clone()
         };
         let color: [f32; 3] = [100.0, 120.0, 140.0];
-        let bent = [255.0 * (color[0] / 255.0).powi(2), color[1], 255.0 * (color[2] / 255.0).sqrt()];
+        let bent = [
+            255.0 * (color[0] / 255.0).powi(2),
+            color[1],
+            255.0 * (color[2] / 255.0).sqrt(),
+        ];
         for (a, b) in twisted.apply(color).iter().zip(correction.apply(bent)) {
             assert!((a - b).abs() < 1e-3);
         }

@@ -1,6 +1,7 @@
 //! `calibrate`: what must be known of camera, arm and color before the light field can be trusted.
 
 pub mod camera;
+pub mod color;
 pub mod hand_eye;
 pub mod pictures;
 pub mod time_offset;
@@ -12,12 +13,13 @@ use clap::Subcommand;
 
 use crate::cli::context::{Context, Ended};
 
-/// Measure camera, arm and clocks.
+/// Measure camera, arm, clocks and colors.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  endofield calibrate camera pictures/ --board checkerboard:9x6 --square-mm 4 -o camera.yaml
   endofield calibrate hand-eye stations/ --camera camera.yaml --board checkerboard:9x6 --square-mm 4
-  endofield calibrate time-offset survey/"
+  endofield calibrate time-offset survey/
+  endofield calibrate color chart.png -o color.yaml"
 )]
 pub struct Args {
     #[command(subcommand)]
@@ -27,6 +29,7 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 enum Subject {
     Camera(camera::Args),
+    Color(color::Args),
     HandEye(hand_eye::Args),
     TimeOffset(time_offset::Args),
 }
@@ -35,6 +38,7 @@ enum Subject {
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     match &args.subject {
         Subject::Camera(args) => camera::run(args, context),
+        Subject::Color(args) => color::run(args, context),
         Subject::HandEye(args) => hand_eye::run(args, context),
         Subject::TimeOffset(args) => time_offset::run(args, context),
     }
