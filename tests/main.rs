@@ -20,6 +20,7 @@ mod feed_fuzz;
 mod import;
 mod light_field;
 mod media;
+mod oblique;
 mod pipeline;
 mod recording;
 mod robot;

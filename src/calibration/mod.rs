@@ -6,4 +6,5 @@ pub mod color;
 pub mod error;
 pub mod hand_eye;
 pub mod homography;
+pub mod oblique;
 pub mod time_offset;

@@ -490,7 +490,7 @@ mod tests {
     #[test]
     fn a_wrong_camera_under_a_scopes_light_is_corrected() {
         let references = references(Edition::Since2014);
-        let (mut sum, runs) = (0.0, 6);
+        let (mut sum, runs) = (0.0, 4);
         for seed in 0..runs {
             let example = taken(
                 960,
@@ -506,17 +506,6 @@ mod tests {
             let used = || fit.patches.iter().filter(|p| !p.patch.out_of_range);
             let after = used().map(|p| p.after).sum::<f64>() / used().count() as f64;
             let before = used().map(|p| p.before).sum::<f64>() / used().count() as f64;
-            println!(
-                "{seed} {:?} {} light {} before {before:.2} after {after:.3} cv {:.3} {:?}",
-                example.ground,
-                fit.shape.name(),
-                fit.light_degree,
-                fit.cross_validated(),
-                fit.trials
-                    .iter()
-                    .map(|t| (t.shape.name(), (t.mean() * 100.0).round() / 100.0))
-                    .collect::<Vec<_>>()
-            );
             assert!(before > 5.0 && after < 1.5, "{seed}: {before} {after}");
             // The truth is an inverse mixing, an exponent and gains: against the truth, on colors that no patch has.
             let tint = Tint::WRONG;
@@ -536,6 +525,7 @@ mod tests {
             }
             sum += worst;
         }
-        println!("worst others {}", sum / runs as f64);
+        // Noise of 2 levels and 8 bits leave about half a unit; colors between the patches must be no worse than the patches.
+        assert!(sum / f64::from(runs as u32) < 1.5, "{sum}");
     }
 }

@@ -3,6 +3,7 @@
 pub mod camera;
 pub mod color;
 pub mod hand_eye;
+pub mod oblique;
 pub mod pictures;
 pub mod time_offset;
 
@@ -31,6 +32,7 @@ enum Subject {
     Camera(camera::Args),
     Color(color::Args),
     HandEye(hand_eye::Args),
+    Oblique(oblique::Args),
     TimeOffset(time_offset::Args),
 }
 
@@ -40,6 +42,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         Subject::Camera(args) => camera::run(args, context),
         Subject::Color(args) => color::run(args, context),
         Subject::HandEye(args) => hand_eye::run(args, context),
+        Subject::Oblique(args) => oblique::run(args, context),
         Subject::TimeOffset(args) => time_offset::run(args, context),
     }
 }
