@@ -8,6 +8,7 @@
 
 mod architecture;
 mod bad_input;
+mod calibrate_color;
 mod calibration;
 mod camera;
 mod cli;
@@ -20,6 +21,7 @@ mod hand_eye;
 mod import;
 mod light_field;
 mod media;
+mod oblique;
 mod pipeline;
 mod recording;
 mod robot;

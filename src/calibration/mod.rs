@@ -2,8 +2,10 @@
 
 pub mod board;
 pub mod camera;
+pub mod color;
 pub mod error;
 pub mod hand_eye;
 pub mod homography;
+pub mod oblique;
 pub mod pivot;
 pub mod time_offset;

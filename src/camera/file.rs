@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use crate::camera::distortion::Distortion;
 use crate::camera::intrinsics::Intrinsics;
 use crate::camera::model::CameraModel;
+use crate::camera::oblique::Oblique;
 use crate::camera::opencv_xml;
 use crate::yaml::{self, Node, YamlError};
 
@@ -110,6 +111,34 @@ pub fn read(path: &Path) -> Result<CameraModel, CameraFileError> {
 /// Write `camera` as a ROS `camera_info` file; an existing file is replaced.
 pub fn write(path: &Path, camera: &CameraModel, name: &str) -> Result<(), CameraFileError> {
     std::fs::write(path, camera_info(camera, name)).map_err(|source| CameraFileError::Unwritable {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Read the joint of an oblique scope from a camera file; `None` if the file tells of none.
+pub fn read_oblique(path: &Path) -> Result<Option<Oblique>, CameraFileError> {
+    let text = std::fs::read_to_string(path).map_err(|source| CameraFileError::Unreadable {
+        path: path.to_owned(),
+        source,
+    })?;
+    // OpenCV's XML knows no such joint.
+    if text.trim_start().starts_with('<') {
+        return Ok(None);
+    }
+    let tree = Node::parse(&text).map_err(|fault| CameraFileError::NotYaml {
+        path: path.to_owned(),
+        fault,
+    })?;
+    Oblique::from_node(&tree).map_err(|fault| CameraFileError::Content {
+        path: path.to_owned(),
+        fault,
+    })
+}
+
+/// Write the camera at angle 0 with the joint of its oblique scope; an existing file is replaced.
+pub fn write_oblique(path: &Path, camera: &CameraModel, oblique: &Oblique, name: &str) -> Result<(), CameraFileError> {
+    std::fs::write(path, camera_info(camera, name) + &oblique.text()).map_err(|source| CameraFileError::Unwritable {
         path: path.to_owned(),
         source,
     })

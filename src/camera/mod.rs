@@ -4,5 +4,6 @@ pub mod distortion;
 pub mod file;
 pub mod intrinsics;
 pub mod model;
+pub mod oblique;
 pub mod opencv_xml;
 pub mod undistortion;

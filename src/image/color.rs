@@ -46,12 +46,42 @@ pub fn srgb_from_linear(linear: f64) -> f64 {
 
 /// CIE XYZ (Y = 1 for white) from 8-bit sRGB.
 pub fn xyz_from_srgb8(color: Rgb8) -> [f64; 3] {
-    let [r, g, b] = color.map(|v| linear_from_srgb(f64::from(v) / 255.0));
+    xyz_from_linear(color.map(|v| linear_from_srgb(f64::from(v) / 255.0)))
+}
+
+/// CIE XYZ (Y = 1 for white) from linear light 0 to 1 in sRGB's primaries; beyond its gamut components are negative.
+pub fn xyz_from_linear([r, g, b]: [f64; 3]) -> [f64; 3] {
     [
         0.412_456_4 * r + 0.357_576_1 * g + 0.180_437_5 * b,
         0.212_672_9 * r + 0.715_152_2 * g + 0.072_175_0 * b,
         0.019_333_9 * r + 0.119_192_0 * g + 0.950_304_1 * b,
     ]
+}
+
+/// Linear light in sRGB's primaries from CIE XYZ; negative beyond the gamut.
+pub fn linear_from_xyz([x, y, z]: [f64; 3]) -> [f64; 3] {
+    [
+        3.240_454_2 * x - 1.537_138_5 * y - 0.498_531_4 * z,
+        -0.969_266_0 * x + 1.876_010_8 * y + 0.041_556_0 * z,
+        0.055_643_4 * x - 0.204_025_9 * y + 1.057_225_2 * z,
+    ]
+}
+
+/// L*a*b* from linear light in sRGB's primaries.
+pub fn lab_from_linear(linear: [f64; 3]) -> Lab {
+    lab_from_xyz(xyz_from_linear(linear))
+}
+
+/// XYZ relative to its white (all 1) from L*a*b*.
+pub fn relative_xyz_from_lab(lab: Lab) -> [f64; 3] {
+    let y = (lab.l + 16.0) / 116.0;
+    [y + lab.a / 500.0, y, y - lab.b / 200.0].map(|f: f64| {
+        if f > 6.0 / 29.0 {
+            f.powi(3)
+        } else {
+            (116.0 * f - 16.0) * 27.0 / 24_389.0
+        }
+    })
 }
 
 /// L*a*b* from XYZ.
@@ -174,6 +204,19 @@ mod tests {
                 "pair {}: {found}, published {expected}",
                 index + 1
             );
+        }
+    }
+
+    #[test]
+    fn xyz_and_lab_are_inverted() {
+        for color in [[255, 255, 255], [12, 200, 90], [200, 3, 40], [5, 5, 9]] {
+            let xyz = xyz_from_srgb8(color);
+            let relative = relative_xyz_from_lab(lab_from_xyz(xyz));
+            for i in 0..3 {
+                assert!((relative[i] * WHITE[i] - xyz[i]).abs() < 1e-9);
+                let linear = linear_from_xyz(xyz)[i];
+                assert!((linear - linear_from_srgb(f64::from(color[i]) / 255.0)).abs() < 1e-5);
+            }
         }
     }
 

@@ -4,6 +4,7 @@ pub mod blur;
 pub mod buffer;
 pub mod canvas;
 pub mod color;
+pub mod color_correction;
 pub mod components;
 pub mod corners;
 pub mod distance;

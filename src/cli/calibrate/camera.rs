@@ -61,8 +61,9 @@ pub struct Args {
     corners_out: Option<PathBuf>,
 }
 
+/// A lens model, as the user names it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum Model {
+pub enum Model {
     /// k1 k2 p1 p2 k3: rigid scopes.
     #[value(name = "plumb_bob")]
     PlumbBob,
@@ -75,7 +76,8 @@ enum Model {
 }
 
 impl Model {
-    fn lens(self) -> LensModel {
+    /// The same, as the solver names it.
+    pub fn lens(self) -> LensModel {
         match self {
             Self::PlumbBob => LensModel::PlumbBob,
             Self::RationalPolynomial => LensModel::RationalPolynomial,

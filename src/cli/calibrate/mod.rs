@@ -1,10 +1,12 @@
 //! `calibrate`: what must be known of camera, arm and color before the light field can be trusted.
 
 pub mod camera;
+pub mod color;
 pub mod hand_eye;
 pub mod hand_eye_report;
 pub mod hand_eye_scene;
 pub mod hands;
+pub mod oblique;
 pub mod pictures;
 pub mod pivot;
 pub mod pose_files;
@@ -17,12 +19,13 @@ use clap::Subcommand;
 
 use crate::cli::context::{Context, Ended};
 
-/// Measure camera, arm and clocks.
+/// Measure camera, arm, clocks and colors.
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  endofield calibrate camera pictures/ --board checkerboard:9x6 --square-mm 4 -o camera.yaml
   endofield calibrate hand-eye stations/ --camera camera.yaml --board checkerboard:9x6 --square-mm 4
   endofield calibrate time-offset survey/
+  endofield calibrate color chart.png -o color.yaml
   endofield calibrate pivot pointer/*.txt"
 )]
 pub struct Args {
@@ -33,7 +36,9 @@ pub struct Args {
 #[derive(Debug, Subcommand)]
 enum Subject {
     Camera(camera::Args),
+    Color(color::Args),
     HandEye(hand_eye::Args),
+    Oblique(oblique::Args),
     TimeOffset(time_offset::Args),
     Pivot(pivot::Args),
 }
@@ -42,7 +47,9 @@ enum Subject {
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     match &args.subject {
         Subject::Camera(args) => camera::run(args, context),
+        Subject::Color(args) => color::run(args, context),
         Subject::HandEye(args) => hand_eye::run(args, context),
+        Subject::Oblique(args) => oblique::run(args, context),
         Subject::TimeOffset(args) => time_offset::run(args, context),
         Subject::Pivot(args) => pivot::run(args, context),
     }

@@ -7,17 +7,19 @@
 //!   covariance: [[900, 640, 520], [640, 560, 430], [520, 430, 410]]   # optional
 //! correction:                        # optional; values 0 to 1
 //!   encoding: linear                 # or srgb (default)
+//!   gamma: [1, 1, 1]                 # optional: exponents of the encoded values, before all else
 //!   matrix: [[0.93, 0.05, 0.02], [0.01, 0.97, 0.02], [0.0, 0.08, 0.92]]
 //!   offset: [0, 0, 0]                # optional
 //!   # or, instead of matrix and offset, one row each for red, green, blue:
 //!   # polynomial: [[…10 numbers: 1 r g b r² g² b² rg gb br…], […], […]]
+//!   # root_polynomial: [[…6 numbers: r g b √rg √gb √br…], […], […]]
 //! ```
 
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::stages::color_normalization::correction::{Correction, Encoding, Formula, TERMS};
+use crate::image::color_correction::{Correction, Encoding, Formula, ROOT_TERMS, TERMS};
 use crate::yaml::Node;
 
 /// Why a file gives no colors.
@@ -119,6 +121,9 @@ impl ColorFile {
                 Encoding::Linear => "linear",
             };
             let mut pairs = vec![("encoding".to_owned(), Node::Text(encoding.to_owned()))];
+            if correction.gamma != [1.0; 3] {
+                pairs.push(("gamma".to_owned(), list(&correction.gamma)));
+            }
             match &correction.formula {
                 Formula::Matrix { matrix, offset } => {
                     pairs.push(("matrix".to_owned(), Node::List(matrix.iter().map(|row| list(row)).collect())));
@@ -127,6 +132,10 @@ impl ColorFile {
                 Formula::Polynomial { coefficients } => {
                     let rows = coefficients.iter().map(|row| list(row)).collect();
                     pairs.push(("polynomial".to_owned(), Node::List(rows)));
+                }
+                Formula::RootPolynomial { coefficients } => {
+                    let rows = coefficients.iter().map(|row| list(row)).collect();
+                    pairs.push(("root_polynomial".to_owned(), Node::List(rows)));
                 }
             }
             Node::Map(pairs).write(&mut text, "correction", 0);
@@ -184,19 +193,31 @@ fn correction(node: &Node) -> Result<Correction, String> {
             ));
         }
     };
+    let gamma = numbers::<3>(node, "gamma")?.unwrap_or([1.0; 3]);
+    if gamma.iter().any(|v| !(0.1..=10.0).contains(v)) {
+        return Err(format!("`gamma` is {gamma:?}, expected three exponents from 0.1 to 10"));
+    }
     let matrix = numbers::<9>(node, "matrix")?;
     let polynomial = numbers::<{ 3 * TERMS }>(node, "polynomial")?;
-    let formula = match (matrix, polynomial) {
-        (Some(matrix), None) => Formula::Matrix {
+    let root_polynomial = numbers::<{ 3 * ROOT_TERMS }>(node, "root_polynomial")?;
+    let formula = match (matrix, polynomial, root_polynomial) {
+        (Some(matrix), None, None) => Formula::Matrix {
             matrix: rows(matrix),
             offset: numbers::<3>(node, "offset")?.unwrap_or_default(),
         },
-        (None, Some(polynomial)) => Formula::Polynomial {
+        (None, Some(polynomial), None) => Formula::Polynomial {
             coefficients: rows(polynomial),
         },
-        _ => return Err("`correction` must hold either `matrix` or `polynomial`".to_owned()),
+        (None, None, Some(root_polynomial)) => Formula::RootPolynomial {
+            coefficients: rows(root_polynomial),
+        },
+        _ => return Err("`correction` must hold either `matrix`, `polynomial` or `root_polynomial`".to_owned()),
     };
-    Ok(Correction { encoding, formula })
+    Ok(Correction {
+        gamma,
+        encoding,
+        formula,
+    })
 }
 
 #[cfg(test)]
@@ -216,8 +237,12 @@ mod tests {
         let polynomial = Formula::Polynomial {
             coefficients: std::array::from_fn(|r| std::array::from_fn(|c| (r * 10 + c) as f64 / 7.0)),
         };
-        for formula in [matrix, polynomial] {
+        let root_polynomial = Formula::RootPolynomial {
+            coefficients: std::array::from_fn(|r| std::array::from_fn(|c| (r * 6 + c) as f64 / 7.0)),
+        };
+        for (formula, gamma) in [(matrix, 1.0), (polynomial, 0.9), (root_polynomial, 1.1)] {
             let correction = Some(Correction {
+                gamma: [gamma; 3],
                 encoding: Encoding::Linear,
                 formula,
             });
@@ -241,6 +266,7 @@ mod tests {
             ),
             ("correction: {encoding: rec709, matrix: [1,0,0,0,1,0,0,0,1]}", "encoding"),
             ("correction: {offset: [0,0,0]}", "either"),
+            ("correction: {gamma: [0,1,1], matrix: [1,0,0,0,1,0,0,0,1]}", "0.1 to 10"),
             ("reference: [", "line"),
         ] {
             let error = ColorFile::parse(text).unwrap_err();

@@ -3,7 +3,7 @@
 //! The colors of a frame form a cluster in RGB space. The stage measures its mean and covariance on a coarse grid without
 //! what is not tissue (`statistics`), finds the affine map that brings them to reference statistics (`matching`: cluster
 //! rotation after Paulus, Csink, Niemann 1998; gray world; statistics transfer), smooths that map over a second or two,
-//! and applies it. A fixed correction of the camera (`correction`, measured by calibration and kept in `color.yaml`)
+//! and applies it. A fixed correction of the camera (`image::color_correction`, measured by calibration and kept in `color.yaml`)
 //! comes before it, a look-up table (`cube_lut`) after it; whatever of them is in use, each pixel is touched once: by the
 //! affine map alone (`affine`), or by one table into which all of them are baked (`cube_lut`). Equalization of the
 //! lightness (`clahe`) is a pass of its own, off by default.
@@ -17,7 +17,6 @@
 pub mod affine;
 pub mod clahe;
 pub mod color_file;
-pub mod correction;
 pub mod cube_lut;
 pub mod matching;
 pub mod settings;

@@ -5,12 +5,12 @@ use rayon::slice::{ParallelSlice as _, ParallelSliceMut as _};
 
 use crate::frame::Frame;
 use crate::image::buffer::{Image, Rgb8};
+use crate::image::color_correction::Correction;
 use crate::image::wide;
 use crate::pipeline::stage::{Stage, StageError};
 use crate::stages::color_normalization::affine::{Affine, AffineRun, BLACK_LEVEL};
 use crate::stages::color_normalization::clahe::Clahe;
 use crate::stages::color_normalization::color_file::{ColorFile, Reference};
-use crate::stages::color_normalization::correction::Correction;
 use crate::stages::color_normalization::cube_lut::{BakedLut, CubeError, CubeLut, LutRun};
 use crate::stages::color_normalization::matching::{affine_between, gray_of};
 use crate::stages::color_normalization::settings::{Method, ReferenceSource, Settings, SettingsError};
