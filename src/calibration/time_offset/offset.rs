@@ -26,6 +26,8 @@ const COARSE_MS: f64 = 10.0;
 const FINE_MS: f64 = 1.0;
 /// … to this far from the coarse best, ms; a parabola is laid through the fine ones.
 const FINE_REACH_MS: f64 = 12.0;
+/// Into how many parts a recording is cut to see whether they agree.
+const PARTS: usize = 3;
 /// The hand's motion: six numbers, and one for what the picture does of itself.
 const INPUTS: usize = 7;
 /// With fewer independent windows the linear function bends to whatever the camera did: some ten seconds are wanted.
@@ -59,6 +61,8 @@ pub struct Offset {
     pub windows: [f64; 2],
     /// Offsets tried (ms) and the logarithms of their likelihoods.
     pub curve: Vec<[f64; 2]>,
+    /// Seconds since the first picture, and the number that is explained best, per window: of the picture, and by the arm.
+    pub traces: Vec<[f64; 3]>,
 }
 
 impl Offset {
@@ -98,6 +102,22 @@ pub enum OffsetError {
 /// Find the offset within ± `range` around `about`.
 pub fn estimate(motions: &[TimedMotion], arm: &PoseBuffer, about: Span, range: Span) -> Result<Offset, OffsetError> {
     let arm = &Path::of(arm);
+    let mut found = estimate_in(motions, arm, about, range)?;
+    // That a linear function does for the whole is only assumed. Where it does not, parts of the recording tell it by what they say.
+    let count = motions.len().div_ceil(PARTS).max(1);
+    let parts: Vec<f64> = (motions.chunks(count))
+        .filter_map(|part| Some(estimate_in(part, arm, about, range).ok()?.offset.milliseconds()))
+        .collect();
+    if parts.len() >= 2 {
+        let n = parts.len() as f64;
+        let mean = parts.iter().sum::<f64>() / n;
+        let of_mean = parts.iter().map(|part| (part - mean).powi(2)).sum::<f64>() / (n * (n - 1.0));
+        found.sigma_ms = found.sigma_ms.max(of_mean.sqrt());
+    }
+    Ok(found)
+}
+
+fn estimate_in(motions: &[TimedMotion], arm: &Path, about: Span, range: Span) -> Result<Offset, OffsetError> {
     let estimates = WINDOWS_S.map(|window_s| estimate_over(window_s, motions, arm, about, range));
     let best = (estimates.iter().flatten())
         .min_by(|a, b| a.sigma_ms.total_cmp(&b.sigma_ms))
@@ -154,7 +174,19 @@ fn estimate_over(window_s: f64, motions: &[TimedMotion], arm: &Path, about: Span
         distinctness: likelihood(&at_best) - rival,
         windows: [window_s, count],
         curve: coarse.iter().map(|(ms, fit)| [*ms, likelihood(fit)]).collect(),
+        traces: traces(&windows, arm, offset_ms, &at_best),
     })
+}
+
+fn traces(windows: &[&Window], arm: &Path, offset_ms: f64, fit: &Fit) -> Vec<[f64; 3]> {
+    let start = windows.first().map_or(Timestamp(0), |first| first.from);
+    (windows.iter())
+        .filter_map(|window| {
+            let by_arm = fit.picture_from_hand.transpose() * hand_motion(arm, window, offset_ms)?;
+            let middle_s = 0.5 * ((window.from - start).seconds() + (window.to - start).seconds());
+            Some([middle_s, window.motion[fit.best], by_arm[fit.best]])
+        })
+        .collect()
 }
 
 /// How many of the overlapping windows count as independent: their number over the sum of their residuals' correlations (Bartlett 1946).
@@ -288,8 +320,9 @@ fn hand_motion(arm: &Path, window: &Window, offset_ms: f64) -> Option<SVector<f6
 struct Fit {
     /// Σ ln(1 − R²) over the four numbers.
     unexplained_log: f64,
-    /// The largest R².
+    /// The largest R², and of which number.
     explained: f64,
+    best: usize,
     /// The linear function.
     picture_from_hand: SMatrix<f64, INPUTS, 4>,
 }
@@ -316,6 +349,7 @@ fn fit(windows: &[&Window], arm: &Path, offset_ms: f64) -> Option<Fit> {
     let mut fit = Fit {
         unexplained_log: 0.0,
         explained: 0.0,
+        best: 0,
         picture_from_hand: solution,
     };
     for c in 0..4 {
@@ -324,7 +358,9 @@ fn fit(windows: &[&Window], arm: &Path, offset_ms: f64) -> Option<Fit> {
         if total > 0.0 {
             let unexplained = (rest / total).clamp(1e-9, 1.0);
             fit.unexplained_log += unexplained.ln();
-            fit.explained = fit.explained.max(1.0 - unexplained);
+            if 1.0 - unexplained > fit.explained {
+                (fit.explained, fit.best) = (1.0 - unexplained, c);
+            }
         }
     }
     Some(fit)

@@ -1,9 +1,11 @@
 //! `calibrate`: what must be known of camera, arm and color before the light field can be trusted.
 
 pub mod camera;
+pub mod camera_path;
 pub mod hand_eye;
 pub mod pictures;
 pub mod time_offset;
+pub mod time_offset_report;
 
 use std::path::{Path, PathBuf};
 
