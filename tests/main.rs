@@ -26,4 +26,5 @@ mod support;
 mod survey;
 mod synthetic;
 mod temporal_median;
+mod time_offset;
 mod undistortion;

@@ -76,6 +76,19 @@ impl PathOffset {
     pub fn is_sure(&self) -> bool {
         self.sigma_ms < 10.0 && self.explained > 0.5 && self.distinctness > 4.5
     }
+
+    /// The mean of two that one arm's readings and two paths through the same pictures told: the readings' errors are the same in both, and
+    /// by how much they differ the paths err.
+    pub fn averaged(self, other: &Self) -> Self {
+        let (one_ms, other_ms) = (self.offset.milliseconds(), other.offset.milliseconds());
+        // Of two with deviation s each, the mean has s/√2 and the difference √2·s: the mean's deviation is half the difference.
+        let paths_ms = 0.5 * (one_ms - other_ms).abs();
+        Self {
+            offset: Span::from_milliseconds(0.5 * (one_ms + other_ms)),
+            sigma_ms: self.sigma_ms.max(other.sigma_ms).hypot(paths_ms),
+            ..self
+        }
+    }
 }
 
 /// Offsets of several stretches of a recording taken together.

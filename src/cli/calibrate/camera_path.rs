@@ -21,7 +21,7 @@ use crate::time::{Span, Timestamp};
 
 /// Pictures are looked at about this wide: corners are found to a tenth of a px, and some hundreds of them tell a turn a hundred times
 /// better than an arm does, px.
-const WIDTH_PX: f32 = 480.0;
+const WIDTH_PX: f32 = 960.0;
 /// Between two views, ms: a scope's path is smooth over that.
 const STEP_MS: f64 = 58.0;
 const MOST_STEP_MS: f64 = 90.0;
@@ -31,92 +31,152 @@ const MOST_VIEWS: usize = 90;
 const MOST_STRETCHES: usize = 3;
 /// Fewer views make no path.
 const FEWEST_VIEWS: usize = 12;
-/// The arm only keeps the whole from floating: it is trusted this little, mm and rad. Were it trusted, the path would be the arm's own,
-/// at whatever offset was assumed.
-const TRUSTED_MM: f64 = 6.0;
-const TRUSTED_RAD: f64 = 0.04;
+/// At first the arm only keeps the whole from floating: were it trusted, the path would be its own, at whatever offset was assumed.
+pub const HARDLY: Trust = Trust {
+    mm: 6.0,
+    rad: 0.04,
+    offset_doubt_ms: 60.0,
+    offset_range_ms: 150.0,
+};
 
-/// A stretch and what the pictures told of it.
-#[derive(Debug)]
-pub struct Stretch {
-    /// First and last exposure.
-    pub ends: [Timestamp; 2],
-    /// The path, or why there is none.
-    pub path: Result<CameraPath, SurveyError>,
-    /// Reprojection error, px of the picture as it was looked at.
-    pub error_px: f64,
+/// How far the arm has a say in the camera's path.
+#[derive(Clone, Copy, Debug)]
+pub struct Trust {
+    /// Deviation of its place per axis, mm.
+    pub mm: f64,
+    /// Of its turn per axis, rad.
+    pub rad: f64,
+    /// Doubt about the offset, ms: along the path, the arm is trusted less by as far as it moves in that time.
+    pub offset_doubt_ms: f64,
+    /// How far around the offset given another may be better, ms.
+    pub offset_range_ms: f64,
 }
 
-/// The arm, distrusted.
-struct LooseArm<'a> {
+impl Trust {
+    /// As far as it errs, but along the path not at all: it straightens what the pictures leave loose, and has no say in the offset.
+    pub fn across([mm, rad]: [f64; 2]) -> Self {
+        Self {
+            mm: mm.clamp(0.02, HARDLY.mm),
+            rad: rad.clamp(1e-4, HARDLY.rad),
+            offset_doubt_ms: 300.0,
+            offset_range_ms: 0.0,
+        }
+    }
+}
+
+/// Which corners are followed: with others, the errors of the path are others.
+#[derive(Clone, Copy, Debug)]
+pub struct Corners {
+    /// Views whose corners are taken.
+    pub anchors: usize,
+    /// Cells along the picture, each with one corner.
+    pub cells: usize,
+}
+
+/// Two choices that have little in common.
+pub const CORNERS: [Corners; 2] = [Corners { anchors: 14, cells: 16 }, Corners { anchors: 9, cells: 21 }];
+
+/// The arm, as far as it is trusted.
+struct TrustedArm<'a> {
     arm: &'a PoseBuffer,
     hand_from_camera: Transform<Hand, Camera>,
+    trust: Trust,
 }
 
-impl PosePrior for LooseArm<'_> {
+impl PosePrior for TrustedArm<'_> {
     fn world_from_camera(&self, at: Timestamp) -> Option<Transform<World, Camera>> {
         let hand = self.arm.pose_at(at).ok()?.base_from_hand;
         Some(Transform::from_isometry(*(hand * self.hand_from_camera).isometry()))
     }
 
     fn sigma_mm(&self) -> f64 {
-        TRUSTED_MM
+        self.trust.mm
     }
 
     fn sigma_rad(&self) -> f64 {
-        TRUSTED_RAD
+        self.trust.rad
     }
 }
 
-/// Paths through the stretches in which the arm moved most; `times` are the frames' exposures, `about` the offset to begin with.
-pub fn stretches(
-    recording: &Recording,
-    camera: &CameraModel,
-    hand_from_camera: Transform<Hand, Camera>,
-    arm: &PoseBuffer,
-    times: &[Timestamp],
-    about: Span,
-    context: &Context,
-) -> anyhow::Result<Vec<Stretch>> {
-    let chosen = chosen_frames(times, arm, about);
-    let mut frames = fetched(recording, camera, &chosen, times, context)?;
-    let prior = LooseArm { arm, hand_from_camera };
-    let settings = survey::Settings {
-        known_time_offset_ms: Some(about.milliseconds()),
-        prior_smoothing_ms: 0.0,
-        max_points: 700,
-        ..Default::default()
-    };
-    let small = camera.reduced(reduction_to(camera.width, WIDTH_PX)).pinhole();
-    context.console.begin("the camera's path", chosen.len() as u64);
-    let mut found = Vec::new();
-    for stretch in &chosen {
-        anyhow::ensure!(!context.console.stopping(), "stopped before the camera's path was found");
-        let rest = frames.split_off(stretch.len().min(frames.len()));
-        let views = std::mem::replace(&mut frames, rest);
-        let Some((first, last)) = views.first().zip(views.last()) else {
-            break;
-        };
-        let ends = [first.exposed_at, last.exposed_at];
-        let refined = survey::refine(&views, &small, &prior, &settings, &Silent);
-        let error_px = refined
-            .as_ref()
-            .map_or(f64::NAN, |refined| refined.report.refined_reprojection_px);
-        let path = refined.map(|refined| {
-            let poses = views.iter().zip(&refined.world_from_camera);
-            let posed = poses.filter_map(|(view, pose)| {
-                Some(PosedPicture {
-                    at: view.exposed_at,
-                    world_from_camera: (*pose)?,
-                })
-            });
-            CameraPath::new(posed.collect(), Span::from_milliseconds(2.5 * MOST_STEP_MS))
-        });
-        found.push(Stretch { ends, path, error_px });
-        context.console.advance(1);
+/// Pictures of stretches, undistorted and small, and the camera that explains them.
+#[derive(Debug)]
+pub struct Stretches {
+    camera: CameraModel,
+    /// In the order of time.
+    pub views: Vec<Vec<SurveyFrame>>,
+}
+
+/// A camera's path and how well it fits its pictures.
+#[derive(Debug)]
+pub struct FoundPath {
+    /// The path.
+    pub path: CameraPath,
+    /// Reprojection error, px of the pictures as they were looked at.
+    pub error_px: f64,
+}
+
+impl Stretches {
+    /// Of the stretches in which the arm moved most; `times` are the frames' exposures, `about` is the offset as far as it is known.
+    pub fn fetched(
+        recording: &Recording,
+        camera: &CameraModel,
+        arm: &PoseBuffer,
+        times: &[Timestamp],
+        about: Span,
+        context: &Context,
+    ) -> anyhow::Result<Self> {
+        let chosen = chosen_frames(times, arm, about);
+        let mut rest = fetched(recording, camera, &chosen, times, context)?;
+        let mut views = Vec::new();
+        for stretch in &chosen {
+            let later = rest.split_off(stretch.len().min(rest.len()));
+            views.push(std::mem::replace(&mut rest, later));
+        }
+        views.retain(|views| !views.is_empty());
+        Ok(Self {
+            camera: camera.reduced(reduction_to(camera.width, WIDTH_PX)).pinhole(),
+            views,
+        })
     }
-    context.console.end();
-    Ok(found)
+
+    /// The camera's path through a stretch's views, beginning at where the arm was at `offset`.
+    pub fn path(
+        &self,
+        views: &[SurveyFrame],
+        arm: &PoseBuffer,
+        hand_from_camera: Transform<Hand, Camera>,
+        offset: Span,
+        trust: Trust,
+        corners: Corners,
+    ) -> Result<FoundPath, SurveyError> {
+        let prior = TrustedArm {
+            arm,
+            hand_from_camera,
+            trust,
+        };
+        let settings = survey::Settings {
+            known_time_offset_ms: Some(offset.milliseconds()),
+            time_offset_range_ms: trust.offset_range_ms,
+            time_offset_doubt_ms: trust.offset_doubt_ms,
+            prior_smoothing_ms: 0.0,
+            max_points: 800,
+            anchors: corners.anchors,
+            corner_cells: corners.cells,
+            ..Default::default()
+        };
+        let refined = survey::refine(views, &self.camera, &prior, &settings, &Silent)?;
+        let poses = views.iter().zip(&refined.world_from_camera);
+        let posed = poses.filter_map(|(view, pose)| {
+            Some(PosedPicture {
+                at: view.exposed_at,
+                world_from_camera: (*pose)?,
+            })
+        });
+        Ok(FoundPath {
+            path: CameraPath::new(posed.collect(), Span::from_milliseconds(2.5 * MOST_STEP_MS)),
+            error_px: refined.report.refined_reprojection_px,
+        })
+    }
 }
 
 /// Numbers of the frames of each stretch, in the order of time.
@@ -137,7 +197,7 @@ fn chosen_frames(times: &[Timestamp], arm: &PoseBuffer, about: Span) -> Vec<Vec<
     let speeds: Vec<Option<[f64; 6]>> = (frames.iter())
         .map(|&frame| {
             let pose = arm.pose_at(*times.get(frame)? - about).ok()?;
-            let (v, w) = (pose.velocity_mm_s / TRUSTED_MM, pose.angular_velocity_rad_s / TRUSTED_RAD);
+            let (v, w) = (pose.velocity_mm_s / HARDLY.mm, pose.angular_velocity_rad_s / HARDLY.rad);
             Some([v.x, v.y, v.z, w.x, w.y, w.z])
         })
         .collect();

@@ -9,7 +9,7 @@ use crate::calibration::time_offset::image_motion::MotionTracker;
 use crate::calibration::time_offset::offset::{self, TimedMotion};
 use crate::calibration::time_offset::path_offset::{self, PathOffset};
 use crate::calibration::time_offset::plot::{Plotted, drawn};
-use crate::cli::calibrate::camera_path::stretches;
+use crate::cli::calibrate::camera_path::{CORNERS, Corners, HARDLY, Stretches, Trust};
 use crate::cli::calibrate::time_offset_report::{Found, Report, StretchReport};
 use crate::cli::console;
 use crate::cli::context::{Context, Ended};
@@ -100,12 +100,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         (None, by_motion) => Found::by_motion(by_motion?),
     };
     let mut report = found.report(watched.times.len());
-    if report.sure {
-        report.drift = drift(
-            &watched.motions,
-            &arm,
-            Span::from_milliseconds(report.time_offset_ms.unwrap_or(0.0)),
-        );
+    if let Some(believed_ms) = report.believed_ms() {
+        report.drift = drift(&watched.motions, &arm, Span::from_milliseconds(believed_ms));
     }
     console::print(&report.table())?;
     if let Some(path) = &json {
@@ -195,29 +191,41 @@ fn by_path(
     };
     let readings: Vec<_> = arm.samples().copied().collect();
     let start = times.first().copied().unwrap_or_default();
-    let found = stretches(recording, camera, hand_eye.hand_from_camera, arm, times, about, context)?;
-    let told = found.into_iter().map(|stretch| {
-        let mut report = StretchReport::new(stretch.ends.map(|end| (end - start).seconds()), stretch.error_px);
-        let told = match &stretch.path {
-            Ok(path) => {
-                report.views = path.poses().len();
-                path_offset::estimate(path, &readings, &hand_eye.hand_from_camera, about, range)
-                    .map_err(|error| error.to_string())
-            }
-            Err(error) => Err(error.to_string()),
+    let stretches = Stretches::fetched(recording, camera, arm, times, about, context)?;
+    context.console.begin("the camera's path", 3 * stretches.views.len() as u64);
+    let mut told = Vec::new();
+    for views in &stretches.views {
+        let ends = [views.first(), views.last()].map(|view| view.map_or(0.0, |view| (view.exposed_at - start).seconds()));
+        let mut report = StretchReport::new(ends);
+        let mut look = |at: Span, trust: Trust, corners: Corners| -> Result<PathOffset, String> {
+            let found = stretches.path(views, arm, hand_eye.hand_from_camera, at, trust, corners);
+            let found = found.map_err(|error| error.to_string())?;
+            (report.views, report.reprojection_px) = (found.path.poses().len(), Some(found.error_px));
+            context.console.advance(1);
+            let told = path_offset::estimate(&found.path, &readings, &hand_eye.hand_from_camera, about, range);
+            told.map_err(|error| error.to_string())
         };
-        match told {
+        // With the offset roughly known, the arm may straighten what the pictures leave loose. By how much paths through other corners
+        // tell other offsets is what the pictures err.
+        let found = look(about, HARDLY, CORNERS[0]).and_then(|rough| {
+            let trust = Trust::across(rough.arm_noise);
+            let [one, other] = CORNERS.map(|corners| look(rough.offset, trust, corners));
+            Ok(one?.averaged(&other?))
+        });
+        anyhow::ensure!(!context.console.stopping(), "stopped before the camera's path was found");
+        match found {
             Ok(offset) => {
                 report.tell(&offset);
-                (report, Some(offset))
+                told.push((report, Some(offset)));
             }
             Err(why) => {
                 report.why_not = Some(why);
-                (report, None)
+                told.push((report, None));
             }
         }
-    });
-    Ok(told.collect())
+    }
+    context.console.end();
+    Ok(told)
 }
 
 /// Seconds into the recording, and what a look at the last seconds told.

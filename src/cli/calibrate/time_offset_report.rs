@@ -22,7 +22,8 @@ pub struct StretchReport {
     to_s: f64,
     /// Pictures on the path.
     pub views: usize,
-    reprojection_px: Option<f64>,
+    /// Root mean square, of the pictures as they were looked at.
+    pub reprojection_px: Option<f64>,
     time_offset_ms: Option<f64>,
     sigma_ms: Option<f64>,
     sure: bool,
@@ -35,12 +36,12 @@ pub struct StretchReport {
 
 impl StretchReport {
     /// Of a stretch that has told nothing yet.
-    pub fn new([from_s, to_s]: [f64; 2], error_px: f64) -> Self {
+    pub fn new([from_s, to_s]: [f64; 2]) -> Self {
         Self {
             from_s,
             to_s,
             views: 0,
-            reprojection_px: error_px.is_finite().then_some(error_px),
+            reprojection_px: None,
             time_offset_ms: None,
             sigma_ms: None,
             sure: false,
@@ -231,6 +232,12 @@ const PLOT_COLUMNS: usize = 61;
 const DEEPEST: f64 = 200.0;
 
 impl Report {
+    /// The offset that the recording begins with, as far as it is sure: what a live line would believe.
+    pub fn believed_ms(&self) -> Option<f64> {
+        let first = self.stretches.iter().find(|stretch| stretch.sure);
+        first.map_or(self.time_offset_ms.filter(|_| self.sure), |stretch| stretch.time_offset_ms)
+    }
+
     /// For a person.
     pub fn table(&self) -> String {
         let mut text = String::new();
@@ -278,8 +285,13 @@ impl Report {
         }
         text.push_str(&plot(&self.curve));
         if !self.drift.is_empty() {
-            let agree = self.drift.iter().filter(|(_, verdict)| verdict == "agree").count();
-            let _ = writeln!(text, "  over the recording: {agree} of {} looks agree", self.drift.len());
+            let count = |what: &str| self.drift.iter().filter(|(_, verdict)| verdict.starts_with(what)).count();
+            let (agree, drifted) = (count("agree"), count("drifted"));
+            let _ = writeln!(
+                text,
+                "  looks at the last seconds: {agree} agree, {drifted} found the clocks apart, {} saw too little motion to tell",
+                self.drift.len() - agree - drifted
+            );
         }
         for (at, verdict) in self.drift.iter().filter(|(_, verdict)| verdict.starts_with("drifted")) {
             let _ = writeln!(text, "  ! at {at:.0} s the clocks have {verdict}");
