@@ -158,7 +158,6 @@ pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
         particles_per_frame: args.particles,
         smoke: args.smoke,
         field_radius: (!args.full_frame).then_some(0.47),
-        ..Settings::default()
     };
     let made = if args.scene == Scene::Calibration {
         simulate_boards(&args.out, &settings, &context.console)

@@ -41,6 +41,8 @@ const BRIGHT_LEVEL: f32 = 30.0;
 const NEAR_BRIGHT_SHARE: f32 = 0.04;
 /// Steps are held back by this share of the slopes' squares, so that a direction without slopes (along a lone line) stays at rest.
 const DAMPING: f64 = 1e-3;
+/// So much more holds a number at rest altogether.
+const LOCKED: f64 = 1e9;
 
 /// How a picture moved against the one before, in shares of its width.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -271,7 +273,9 @@ fn step(previous: &Level0, current: &Pyramid, level: usize, similarity: &Similar
     }
     let slopes = normal[(0, 0)] + normal[(1, 1)];
     let reach = 0.25 * (width as f64).powi(2);
-    for (unknown, size) in [1.0, 1.0, reach, reach].into_iter().enumerate() {
+    // What a lone line's shift and growth do to it is the same: on black, nothing grows.
+    let growth = if previous.on_black { LOCKED * reach } else { reach };
+    for (unknown, size) in [1.0, 1.0, reach, growth].into_iter().enumerate() {
         normal[(unknown, unknown)] += DAMPING * slopes * size;
     }
     let step = normal.cholesky()?.solve(&side);

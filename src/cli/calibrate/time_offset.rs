@@ -93,7 +93,10 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let by_path = match args.by {
         By::ImageMotion => None,
         By::Best if recording.camera.is_none() || recording.hand_eye.is_none() => None,
-        By::Best | By::CameraPath => Some(by_path(&recording, &arm, &watched.times, [about, range], context)?),
+        By::Best | By::CameraPath => {
+            let start = by_motion.as_ref().ok().map(|found| found.offset);
+            Some(by_path(&recording, &arm, &watched.times, [about, range], start, context)?)
+        }
     };
     let found = match (by_path, by_motion) {
         (Some(stretches), by_motion) => Found::by_path(stretches, by_motion.ok(), range),
@@ -184,6 +187,7 @@ fn by_path(
     arm: &PoseBuffer,
     times: &[Timestamp],
     [about, range]: [Span; 2],
+    by_motion: Option<Span>,
     context: &Context,
 ) -> anyhow::Result<Vec<ToldByPath>> {
     let (Some(camera), Some(hand_eye)) = (&recording.camera, &recording.hand_eye) else {
@@ -207,7 +211,16 @@ fn by_path(
         };
         // With the offset roughly known, the arm may straighten what the pictures leave loose. By how much paths through other corners
         // tell other offsets is what the pictures err.
-        let found = look(about, HARDLY, CORNERS[0]).and_then(|rough| {
+        let mut rough = look(about, HARDLY, CORNERS[0]);
+        // Begun far from the truth, a path may be bent: the picture's motion, however rough, is another place to begin.
+        if let Some(start) = by_motion
+            && !rough.as_ref().is_ok_and(PathOffset::is_sure)
+            && let Ok(again) = look(start, HARDLY, CORNERS[0])
+            && rough.as_ref().map_or(true, |rough| again.sigma_ms < rough.sigma_ms)
+        {
+            rough = Ok(again);
+        }
+        let found = rough.and_then(|rough| {
             let trust = Trust::across(rough.arm_noise);
             let [one, other] = CORNERS.map(|corners| look(rough.offset, trust, corners));
             Ok(one?.averaged(&other?))
