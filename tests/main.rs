@@ -29,4 +29,5 @@ mod support;
 mod survey;
 mod synthetic;
 mod temporal_median;
+mod time_offset;
 mod undistortion;

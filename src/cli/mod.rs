@@ -6,6 +6,7 @@ pub mod console;
 pub mod context;
 pub mod demo;
 pub mod import;
+pub mod import_sequence;
 pub mod light_field;
 pub mod measure;
 pub mod outputs;
@@ -53,6 +54,7 @@ enum Command {
     Process(process::Args),
     LightField(light_field::Args),
     Simulate(simulate::Args),
+    Import(import_sequence::Args),
     Arm(arm::Args),
 }
 
@@ -121,6 +123,7 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
             light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete)
         }
         Command::Simulate(args) => simulate::run(args, context),
+        Command::Import(args) => import_sequence::run(&args, context),
         Command::Arm(args) => arm::run(&args, context),
     }
 }

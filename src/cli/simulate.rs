@@ -29,10 +29,13 @@ pub struct Args {
     /// Size of the pictures, px.
     #[arg(long, default_value = "960x540", value_parser = size_from_text)]
     size: Size,
-    /// Frames of the live recording (25 a second).
+    /// Frames a second, of both recordings.
+    #[arg(long, default_value_t = 25.0, value_name = "N")]
+    fps: f64,
+    /// Frames of the live recording.
     #[arg(long, default_value_t = 100)]
     frames: usize,
-    /// Frames of the survey (25 a second).
+    /// Frames of the survey.
     #[arg(long, default_value_t = 72)]
     survey_frames: usize,
     /// Stroke of a breath, mm (12 breaths a minute).
@@ -66,7 +69,7 @@ pub struct Args {
     #[arg(long, default_value_t = 0.08)]
     pose_noise_deg: f64,
     /// How late the stamps of the arm's poses are, ms.
-    #[arg(long, default_value_t = 40.0)]
+    #[arg(long, default_value_t = 40.0, allow_negative_numbers = true)]
     pose_late_ms: f64,
     /// From the hand to the lens, mm.
     #[arg(long, default_value_t = 300.0)]
@@ -129,6 +132,7 @@ pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
         seed: args.seed,
         width: args.size.width,
         height: args.size.height,
+        frame_rate_hz: args.fps,
         survey_frames: args.survey_frames,
         live_frames: args.frames,
         arm: ArmSettings {
@@ -154,7 +158,6 @@ pub fn run(args: Args, context: &Context) -> anyhow::Result<Ended> {
         particles_per_frame: args.particles,
         smoke: args.smoke,
         field_radius: (!args.full_frame).then_some(0.47),
-        ..Settings::default()
     };
     let made = if args.scene == Scene::Calibration {
         simulate_boards(&args.out, &settings, &context.console)

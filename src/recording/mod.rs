@@ -2,3 +2,4 @@
 
 pub mod folder;
 pub mod frame_times;
+pub mod meta_image;

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use crate::calibration::time_offset::offset::{TimedMotion, estimate};
+use crate::calibration::time_offset::offset::{TimedMotion, glance};
 use crate::robot::pose_buffer::PoseBuffer;
 use crate::time::{Span, Timestamp};
 
@@ -72,7 +72,7 @@ impl DriftWatch {
         if seen_s < LEAST_S {
             return Some(Verdict::Silent);
         }
-        let found = estimate(
+        let found = glance(
             self.motions.make_contiguous(),
             arm,
             self.believed,

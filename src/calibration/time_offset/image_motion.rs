@@ -21,6 +21,11 @@ const MARGIN_PX: usize = 4;
 /// Darker is the black surround, brighter the lamp, levels.
 const USABLE_LEVELS: std::ops::Range<f32> = 12.0..236.0;
 const LEVELS: usize = 4;
+/// Ultrasound comes slowly and moves far in between: there, the shift is first looked for at this level, in shares of width and height.
+const SEARCH_LEVEL: usize = 2;
+const SEARCH_SHARE: [f32; 2] = [0.12, 0.3];
+/// What a px more must gain in correlation.
+const SHORTER_SHARE: f32 = 0.01;
 /// Right, down, turn, growth, contrast.
 const UNKNOWNS: usize = 5;
 const ROUNDS: usize = 12;
@@ -28,6 +33,16 @@ const ROUNDS: usize = 12;
 const SETTLED_PX: f32 = 0.002;
 /// At least this share of the picture must be usable.
 const LEAST_SHARE: f32 = 0.02;
+/// A picture with less that is usable and something this bright is no endoscope's: bright on black, as ultrasound is, and black is
+/// part of it …
+const BRIGHT_LEVEL: f32 = 30.0;
+/// … as far as it lies near: where a blur of the detail's size still has this share of its peak. Far from all that is bright nothing can
+/// move, and so much nothing would make everything else an outlier.
+const NEAR_BRIGHT_SHARE: f32 = 0.04;
+/// Steps are held back by this share of the slopes' squares, so that a direction without slopes (along a lone line) stays at rest.
+const DAMPING: f64 = 1e-3;
+/// So much more holds a number at rest altogether.
+const LOCKED: f64 = 1e9;
 
 /// How a picture moved against the one before, in shares of its width.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -58,6 +73,8 @@ pub struct MotionTracker {
 
 #[derive(Debug)]
 struct Level0 {
+    /// Bright on black.
+    on_black: bool,
     pyramid: Pyramid,
     slopes: Vec<(Image<f32>, Image<f32>)>,
 }
@@ -91,7 +108,18 @@ impl MotionTracker {
             *valid = if USABLE_LEVELS.contains(level) { 255 } else { 0 };
         }
         // What is half the lamp's is not usable either.
-        let valid = eroded(&valid, 1);
+        let mut valid = eroded(&valid, 1);
+        let usable = valid.pixels().iter().filter(|valid| **valid != 0).count() as f32;
+        let on_black =
+            usable < 2.0 * LEAST_SHARE * valid.pixels().len() as f32 && gray.pixels().iter().any(|level| *level > BRIGHT_LEVEL);
+        if on_black {
+            let mut near = gray.clone();
+            gaussian_blur(&mut near, DETAIL_SIGMA_PX, &mut self.scratch);
+            let most = near.pixels().iter().copied().fold(0.0, f32::max);
+            for (valid, near) in valid.pixels_mut().iter_mut().zip(near.pixels()) {
+                *valid = if *near > NEAR_BRIGHT_SHARE * most { 255 } else { 0 };
+            }
+        }
         // The lamp's image must not bleed into what is slow around it: only usable pixels are averaged (normalized convolution).
         let mut slow = gray.clone();
         let mut weight = Image::filled(gray.width(), gray.height(), 0.0);
@@ -113,7 +141,11 @@ impl MotionTracker {
         }
         let pyramid = Pyramid::new(gray, trusted, LEVELS);
         let slopes = pyramid.levels.iter().map(gradient).collect();
-        Level0 { pyramid, slopes }
+        Level0 {
+            on_black,
+            pyramid,
+            slopes,
+        }
     }
 }
 
@@ -128,9 +160,14 @@ struct Similarity {
 
 fn aligned(previous: &Level0, current: &Pyramid) -> Option<ImageMotion> {
     let mut similarity = Similarity::default();
-    for level in (0..current.levels.len()).rev() {
+    let mut from = current.levels.len();
+    if previous.on_black && SEARCH_LEVEL < from {
+        similarity = searched(&previous.pyramid.levels[SEARCH_LEVEL], &current.levels[SEARCH_LEVEL]);
+        from = SEARCH_LEVEL + 1;
+    }
+    for level in (0..from).rev() {
         let scale = 2.0_f32;
-        if level + 1 < current.levels.len() {
+        if level + 1 < from {
             similarity.right *= scale;
             similarity.down *= scale;
         }
@@ -154,6 +191,43 @@ fn aligned(previous: &Level0, current: &Pyramid) -> Option<ImageMotion> {
         turn: f64::from(similarity.turn),
         growth: f64::from(similarity.growth),
     })
+}
+
+/// The whole shift, in px of the level, at which two pictures correlate best.
+fn searched(before: &Image<f32>, after: &Image<f32>) -> Similarity {
+    let (width, height) = before.size();
+    let reach = [
+        (SEARCH_SHARE[0] * width as f32) as isize,
+        (SEARCH_SHARE[1] * height as f32) as isize,
+    ];
+    let correlation = |right: isize, down: isize| {
+        let (mut product, mut square) = (0.0_f32, 1e-9_f32);
+        for y in 0..height {
+            let Some(row) = y.checked_add_signed(down).filter(|row| *row < after.height()) else {
+                continue;
+            };
+            for x in 0..width {
+                let Some(column) = x.checked_add_signed(right).filter(|column| *column < after.width()) else {
+                    continue;
+                };
+                let level = after.at(column, row);
+                product += before.at(x, y) * level;
+                square += level * level;
+            }
+        }
+        // Along a line all shifts are alike: the shortest is meant.
+        product / square.sqrt() * (1.0 - SHORTER_SHARE * (right.abs() + down.abs()) as f32)
+    };
+    let shifts = (-reach[1]..=reach[1]).flat_map(|down| (-reach[0]..=reach[0]).map(move |right| (right, down)));
+    let best = shifts
+        .map(|(right, down)| (correlation(right, down), right, down))
+        .max_by(|a, b| a.0.total_cmp(&b.0));
+    let (_, right, down) = best.unwrap_or((0.0, 0, 0));
+    Similarity {
+        right: right as f32,
+        down: down as f32,
+        ..Similarity::default()
+    }
 }
 
 /// A Gauss–Newton step: by how much the similarity overshoots. Slopes are the previous picture's, the same at every round; a change of
@@ -196,6 +270,13 @@ fn step(previous: &Level0, current: &Pyramid, level: usize, similarity: &Similar
         let slope = slope.cast::<f64>();
         normal += weight * slope * slope.transpose();
         side += weight * f64::from(*residual) * slope;
+    }
+    let slopes = normal[(0, 0)] + normal[(1, 1)];
+    let reach = 0.25 * (width as f64).powi(2);
+    // What a lone line's shift and growth do to it is the same: on black, nothing grows.
+    let growth = if previous.on_black { LOCKED * reach } else { reach };
+    for (unknown, size) in [1.0, 1.0, reach, growth].into_iter().enumerate() {
+        normal[(unknown, unknown)] += DAMPING * slopes * size;
     }
     let step = normal.cholesky()?.solve(&side);
     step.iter().all(|s| s.is_finite()).then(|| step.cast::<f32>())
@@ -248,6 +329,35 @@ mod tests {
                     "{found} for {wanted}"
                 );
             }
+        }
+    }
+
+    /// A thin bright line on black, as ultrasound shows the bottom of a tank; along the line nothing can be told, and nothing is made up.
+    #[test]
+    fn a_lone_line_moves_across_itself() {
+        let line = |down: f64, turn: f64| {
+            let (width, height) = SIZE;
+            let mut image = Image::filled(width, height, [0; 3]);
+            for x in 60..420 {
+                for y in 0..height {
+                    let away = y as f64 - 120.0 - down - (turn + 0.05) * (x as f64 - 239.5);
+                    let level = (150.0 * (-0.5 * (away / 4.0).powi(2)).exp()) as u8;
+                    image.set(x, y, [level; 3]);
+                }
+            }
+            image
+        };
+        let mut tracker = MotionTracker::default();
+        tracker.next(&line(0.0, 0.0));
+        for (down, turn) in [(3.0, 0.0), (-8.0, 0.01), (0.0, 0.0), (55.0, 0.0)] {
+            tracker.reset();
+            tracker.next(&line(0.0, 0.0));
+            let found = tracker.next(&line(down, turn)).unwrap();
+            assert!((found.down - down / 480.0).abs() < 0.3 / 480.0, "{down} {turn}: {found:?}");
+            assert!(
+                (found.turn - turn).abs() < 0.002 && found.right.abs() < 1.0 / 480.0,
+                "{down} {turn}: {found:?}"
+            );
         }
     }
 

@@ -2,8 +2,8 @@
 //!
 //! Over windows of some tenths of a second, the picture's motion (four numbers) is a linear function of the hand's motion (six), whatever the
 //! camera's place on the hand and as long as the tissue's distance changes little. At each shift τ that function is found by least
-//! squares; the likelihood of τ is −n/2·Σ ln(1 − R²) over the four numbers, R² being the share explained (Bates and Watts 1988, on
-//! profile likelihoods). Coarse, then fine; the deviation of τ from the likelihood's curvature. n counts windows as far as their residuals
+//! squares; the likelihood of τ is −n/2·Σ ln(1 − R²) over those of the four numbers that it explains at some τ, R² being the share
+//! explained (Bates and Watts 1988, on profile likelihoods). Coarse, then fine; the deviation of τ from the likelihood's curvature. n counts windows as far as their residuals
 //! are independent. Long windows time better, short ones are more: the length that tells most is taken.
 //! PLUS (Lasso et al. 2014) correlates one number of each instead, and needs a phantom for it.
 
@@ -26,6 +26,10 @@ const COARSE_MS: f64 = 10.0;
 const FINE_MS: f64 = 1.0;
 /// … to this far from the coarse best, ms; a parabola is laid through the fine ones.
 const FINE_REACH_MS: f64 = 12.0;
+/// A number of which the arm leaves more than this unexplained at its best is not heard, unless it is the best there is.
+const HEARD_UNEXPLAINED: f64 = 0.5;
+/// Into how many parts a recording is cut to see whether they agree.
+const PARTS: usize = 3;
 /// The hand's motion: six numbers, and one for what the picture does of itself.
 const INPUTS: usize = 7;
 /// With fewer independent windows the linear function bends to whatever the camera did: some ten seconds are wanted.
@@ -59,6 +63,8 @@ pub struct Offset {
     pub windows: [f64; 2],
     /// Offsets tried (ms) and the logarithms of their likelihoods.
     pub curve: Vec<[f64; 2]>,
+    /// Seconds since the first picture, and the number that is explained best, per window: of the picture, and by the arm.
+    pub traces: Vec<[f64; 3]>,
 }
 
 impl Offset {
@@ -98,6 +104,27 @@ pub enum OffsetError {
 /// Find the offset within ± `range` around `about`.
 pub fn estimate(motions: &[TimedMotion], arm: &PoseBuffer, about: Span, range: Span) -> Result<Offset, OffsetError> {
     let arm = &Path::of(arm);
+    let mut found = best_window(motions, arm, about, range)?;
+    // That a linear function does for the whole is only assumed. Where it does not, parts of the recording tell it by what they say.
+    let count = motions.len().div_ceil(PARTS).max(1);
+    let parts: Vec<f64> = (motions.chunks(count))
+        .filter_map(|part| Some(best_window(part, arm, about, range).ok()?.offset.milliseconds()))
+        .collect();
+    if parts.len() >= 2 {
+        let n = parts.len() as f64;
+        let mean = parts.iter().sum::<f64>() / n;
+        let of_mean = parts.iter().map(|part| (part - mean).powi(2)).sum::<f64>() / (n * (n - 1.0));
+        found.sigma_ms = found.sigma_ms.max(of_mean.sqrt());
+    }
+    Ok(found)
+}
+
+/// The same over a few seconds, too few to be cut into parts.
+pub fn glance(motions: &[TimedMotion], arm: &PoseBuffer, about: Span, range: Span) -> Result<Offset, OffsetError> {
+    best_window(motions, &Path::of(arm), about, range)
+}
+
+fn best_window(motions: &[TimedMotion], arm: &Path, about: Span, range: Span) -> Result<Offset, OffsetError> {
     let estimates = WINDOWS_S.map(|window_s| estimate_over(window_s, motions, arm, about, range));
     let best = (estimates.iter().flatten())
         .min_by(|a, b| a.sigma_ms.total_cmp(&b.sigma_ms))
@@ -128,21 +155,30 @@ fn estimate_over(window_s: f64, motions: &[TimedMotion], arm: &Path, about: Span
         fits.filter_map(|ms| Some((ms, fit(&windows, arm, ms)?))).collect()
     };
     let coarse = fits(center_ms, COARSE_MS, steps);
+    // A number that the arm does not explain at any offset moves for reasons of its own, and at times of its own.
+    let least: [f64; 4] = std::array::from_fn(|c| coarse.iter().map(|(_, fit)| fit.unexplained_logs[c]).fold(0.0, f64::min));
+    let bar = HEARD_UNEXPLAINED.ln().max(least.iter().copied().fold(0.0, f64::min));
+    let unexplained_log = |fit: &Fit| {
+        (0..4)
+            .filter(|&c| least[c] <= bar)
+            .map(|c| fit.unexplained_logs[c])
+            .sum::<f64>()
+    };
     let (coarse_ms, _) = (coarse.iter())
-        .min_by(|a, b| a.1.unexplained_log.total_cmp(&b.1.unexplained_log))
+        .min_by(|a, b| unexplained_log(&a.1).total_cmp(&unexplained_log(&b.1)))
         .ok_or(OffsetError::NoMotion)?;
     if (coarse_ms - center_ms).abs() > range_ms - COARSE_MS {
         return Err(OffsetError::AtTheEnd { at_ms: *coarse_ms });
     }
     let fine = fits(*coarse_ms, FINE_MS, (FINE_REACH_MS / FINE_MS) as i32);
-    let points: Vec<[f64; 2]> = fine.iter().map(|(ms, fit)| [ms - coarse_ms, fit.unexplained_log]).collect();
+    let points: Vec<[f64; 2]> = fine.iter().map(|(ms, fit)| [ms - coarse_ms, unexplained_log(fit)]).collect();
     let [lowest, curvature] = parabola(&points)
         .filter(|[_, curvature]| *curvature > 0.0)
         .ok_or(OffsetError::NoMotion)?;
     let offset_ms = coarse_ms + lowest.clamp(-FINE_REACH_MS, FINE_REACH_MS);
     let at_best = fit(&windows, arm, offset_ms).ok_or(OffsetError::NoMotion)?;
     let count = independent(&windows, arm, offset_ms, &at_best).ok_or(OffsetError::NoMotion)?;
-    let likelihood = |fit: &Fit| -0.5 * count * fit.unexplained_log;
+    let likelihood = |fit: &Fit| -0.5 * count * unexplained_log(fit);
     let rivals = coarse
         .iter()
         .filter(|(ms, _)| (ms - offset_ms).abs() > PEAK_MS.min(0.5 * range_ms));
@@ -154,7 +190,19 @@ fn estimate_over(window_s: f64, motions: &[TimedMotion], arm: &Path, about: Span
         distinctness: likelihood(&at_best) - rival,
         windows: [window_s, count],
         curve: coarse.iter().map(|(ms, fit)| [*ms, likelihood(fit)]).collect(),
+        traces: traces(&windows, arm, offset_ms, &at_best),
     })
+}
+
+fn traces(windows: &[&Window], arm: &Path, offset_ms: f64, fit: &Fit) -> Vec<[f64; 3]> {
+    let start = windows.first().map_or(Timestamp(0), |first| first.from);
+    (windows.iter())
+        .filter_map(|window| {
+            let by_arm = fit.picture_from_hand.transpose() * hand_motion(arm, window, offset_ms)?;
+            let middle_s = 0.5 * ((window.from - start).seconds() + (window.to - start).seconds());
+            Some([middle_s, window.motion[fit.best], by_arm[fit.best]])
+        })
+        .collect()
 }
 
 /// How many of the overlapping windows count as independent: their number over the sum of their residuals' correlations (Bartlett 1946).
@@ -286,10 +334,11 @@ fn hand_motion(arm: &Path, window: &Window, offset_ms: f64) -> Option<SVector<f6
 /// How well the arm's motion explains the picture's.
 #[derive(Clone, Copy, Debug)]
 struct Fit {
-    /// Σ ln(1 − R²) over the four numbers.
-    unexplained_log: f64,
-    /// The largest R².
+    /// ln(1 − R²) of the four numbers.
+    unexplained_logs: [f64; 4],
+    /// The largest R², and of which number.
     explained: f64,
+    best: usize,
     /// The linear function.
     picture_from_hand: SMatrix<f64, INPUTS, 4>,
 }
@@ -314,8 +363,9 @@ fn fit(windows: &[&Window], arm: &Path, offset_ms: f64) -> Option<Fit> {
     }
     let solution = normal.cholesky()?.solve(&side);
     let mut fit = Fit {
-        unexplained_log: 0.0,
+        unexplained_logs: [0.0; 4],
         explained: 0.0,
+        best: 0,
         picture_from_hand: solution,
     };
     for c in 0..4 {
@@ -323,8 +373,10 @@ fn fit(windows: &[&Window], arm: &Path, offset_ms: f64) -> Option<Fit> {
         let rest = (squares[c] - solution.column(c).dot(&side.column(c))).max(1e-9 * total);
         if total > 0.0 {
             let unexplained = (rest / total).clamp(1e-9, 1.0);
-            fit.unexplained_log += unexplained.ln();
-            fit.explained = fit.explained.max(1.0 - unexplained);
+            fit.unexplained_logs[c] = unexplained.ln();
+            if 1.0 - unexplained > fit.explained {
+                (fit.explained, fit.best) = (1.0 - unexplained, c);
+            }
         }
     }
     Some(fit)

@@ -1,6 +1,7 @@
 //! `calibrate`: what must be known of camera, arm and color before the light field can be trusted.
 
 pub mod camera;
+pub mod camera_path;
 pub mod color;
 pub mod hand_eye;
 pub mod hand_eye_report;
@@ -11,6 +12,7 @@ pub mod pictures;
 pub mod pivot;
 pub mod pose_files;
 pub mod time_offset;
+pub mod time_offset_report;
 
 use std::path::{Path, PathBuf};
 
