@@ -212,3 +212,39 @@ fn the_command_finds_hand_and_clock_of_a_simulated_arm() {
     let plot = endofield::media::image_files::read(&folder.path().join("hand_eye_report.png")).unwrap();
     assert!(plot.width() > 800);
 }
+
+#[test]
+fn the_command_needs_no_board_where_the_scene_has_texture() {
+    let folder = tempfile::tempdir().unwrap();
+    let sim = endofield(
+        &[
+            "simulate",
+            "sim",
+            "--size",
+            "480x270",
+            "--frames",
+            "2",
+            "--survey-frames",
+            "72",
+            "--seed",
+            "3",
+        ],
+        folder.path(),
+    );
+    assert!(sim.status.success(), "{}", told(&sim));
+    let ran = endofield(&["calibrate", "hand-eye", "sim/survey", "-o", "found.yaml"], folder.path());
+    assert!(ran.status.success(), "{}", told(&ran));
+    let found = HandEye::read(&folder.path().join("found.yaml")).unwrap();
+    let truth = HandEye::read(&folder.path().join("sim/survey/hand_eye.yaml")).unwrap();
+    let [mm, deg] = apart(&found.hand_from_camera, &truth.hand_from_camera);
+    let covariance = found.covariance.unwrap();
+    let deviation = |first: usize| (first..first + 3).map(|i| covariance[(i, i)]).sum::<f64>().sqrt();
+    assert!(
+        mm < 3.0 * deviation(0) && deg < 3.0 * deviation(3).to_degrees(),
+        "{mm} ± {} mm, {deg} ± {}°\n{}",
+        deviation(0),
+        deviation(3).to_degrees(),
+        told(&ran)
+    );
+    assert!(mm < 3.0 && deg < 0.6, "{mm} mm, {deg}°");
+}
