@@ -43,6 +43,8 @@ const FEWEST_READINGS: usize = 24;
 const ALIKE_S: [f64; 4] = [0.08, 0.16, 0.32, 0.64];
 /// So many windows are needed for their sum to mean anything.
 const FEWEST_WINDOWS: f64 = 6.0;
+/// Into how many parts the readings are cut to see whether they agree.
+const PARTS: usize = 3;
 /// Half width of what counts as the peak itself when rivals are looked for, ms.
 const PEAK_MS: f64 = 60.0;
 /// Looked at for the derivative by τ, ms.
@@ -187,7 +189,8 @@ pub fn estimate(
     if (offset_ms - best_ms).abs() > 3.0 * COARSE_MS {
         return Err(PathOffsetError::NotObserved);
     }
-    let [white_sigma_ms, sigma_ms] = matching.deviations(&best).ok_or(PathOffsetError::NotObserved)?;
+    let [white_sigma_ms, alike_sigma_ms] = matching.deviations(&best).ok_or(PathOffsetError::NotObserved)?;
+    let sigma_ms = alike_sigma_ms * matching.scatter_of_parts(offset_ms);
     // Readings count as far as they tell something new.
     let count = best.count as f64 * (white_sigma_ms / sigma_ms).powi(2);
     let curve: Vec<[f64; 2]> = (coarse.iter())
@@ -452,6 +455,27 @@ impl Matching<'_> {
             worst = worst.max((sum.max(0.0) / left / (1.0 - window_s / whole_s)).sqrt());
         }
         (white.is_finite() && worst.is_finite()).then_some([white, worst])
+    }
+
+    /// By how many times the offsets of the parts, each with a similarity of its own, differ more than they should; 1 where they agree. A
+    /// path that is bent over seconds gives itself away by it (Birge 1932, as with stretches).
+    fn scatter_of_parts(&self, offset_ms: f64) -> f64 {
+        let used: Vec<TimedPose> = self.readings(offset_ms).copied().collect();
+        let found: Vec<[f64; 2]> = (used.chunks(used.len().div_ceil(PARTS).max(1)))
+            .filter_map(|arm| {
+                let part = Matching { arm, ..*self };
+                let fit = part.fitted(offset_ms, OffsetIs::Sought)?;
+                Some([fit.state.offset_ms, part.deviations(&fit)?[1]])
+            })
+            .collect();
+        if found.len() < 2 {
+            return 1.0;
+        }
+        let weights: f64 = found.iter().map(|[_, sigma]| sigma.powi(-2)).sum();
+        let mean = found.iter().map(|[ms, sigma]| ms * sigma.powi(-2)).sum::<f64>() / weights;
+        let misfit: f64 = found.iter().map(|[ms, sigma]| ((ms - mean) / sigma).powi(2)).sum();
+        let scatter = (misfit / (found.len() - 1) as f64).sqrt();
+        if scatter.is_finite() { scatter.max(1.0) } else { 1.0 }
     }
 
     /// Share of the variance of place and of turn that is no residual; the worse of the two.
