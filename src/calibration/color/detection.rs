@@ -406,8 +406,8 @@ mod tests {
             .into_par_iter()
             .filter_map(|seed| {
                 let example = taken(
-                    640,
                     480,
+                    360,
                     &Setting {
                         seed,
                         ..Setting::default()

@@ -272,9 +272,9 @@ fn start(chart: &Chart<'_>) -> Option<Vec<f64>> {
             let terms: Vec<[f64; 2]> = light_slopes(chart.degree, place(patch.patch)).collect();
             // A slope bent by glare must not bend the start.
             let weight = 1.0 / (0.03_f64.powi(2) + patch.slope_sigma.powi(2));
-            for axis in 0..2 {
-                let row = DVector::from_fn(each, |i, _| terms[i][axis]);
-                right += weight * patch.slope[axis].clamp(-0.5, 0.5) * &row;
+            for (axis, slope) in patch.slope.iter().enumerate() {
+                let row = DVector::from_iterator(each, terms.iter().map(|term| term[axis]));
+                right += weight * slope.clamp(-0.5, 0.5) * &row;
                 normal += weight * &row * row.transpose();
             }
         }

@@ -163,7 +163,7 @@ fn flat(samples: &[Sample]) -> Vector3<f64> {
 }
 
 /// ln(luminance) as a plane, and the standard deviation of its slopes.
-fn fitted<'a>(samples: &mut dyn Iterator<Item = &'a Sample>) -> Option<(Vector3<f64>, f64)> {
+fn fitted(samples: &mut dyn Iterator<Item = &Sample>) -> Option<(Vector3<f64>, f64)> {
     let (mut normal, mut right, mut squares, mut n) = (Matrix3::zeros(), Vector3::zeros(), 0.0, 0.0);
     for sample in samples {
         let row = Vector3::new(1.0, sample.at[0], sample.at[1]);

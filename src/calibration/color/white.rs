@@ -91,7 +91,7 @@ impl White {
                 found_percent: 100.0 * share,
             });
         }
-        let [red, blue] = ratios.map(|values| middle_and_deviation(values));
+        let [red, blue] = ratios.map(middle_and_deviation);
         let spread = [red[1], blue[1]];
         if spread.iter().any(|deviation| *deviation > MOST_SPREAD) {
             return Err(NoWhite::ManyColors {

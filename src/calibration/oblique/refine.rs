@@ -672,7 +672,7 @@ mod tests {
             (70.0, degrees([0.0, -20.0, -10.0, 10.0, 20.0])),
         ] {
             let truth = joint(tilt.to_radians());
-            let runs: u64 = 40;
+            let runs: u64 = 24;
             let results: Vec<(Vec<f64>, f64)> = (0..runs)
                 .into_par_iter()
                 .map(|seed| {
@@ -705,7 +705,7 @@ mod tests {
                     within(place)
                 );
             }
-            // The mean of 40 χ² of n degrees is n ± 4·√(2n/40).
+            // The mean of 24 χ² of n degrees is n ± 4·√(2n/24).
             let mean = results.iter().map(|(_, squared)| squared).sum::<f64>() / runs as f64;
             let bound = 4.0 * (2.0 * n as f64 / runs as f64).sqrt();
             assert!((mean - n as f64).abs() < bound + 1.0, "{tilt}°: {mean} {n}");
