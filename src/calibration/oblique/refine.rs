@@ -6,22 +6,21 @@
 //! deviations are left out, and the rest is solved plainly: the covariance is σ²(JᵀJ)⁻¹.
 
 use std::collections::BTreeMap;
-use std::ops::Range;
 
-use nalgebra::{DMatrix, Unit, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{DMatrix, Unit};
 
-use crate::calibration::board::detection::BoardCorner;
-use crate::calibration::camera::lens::{self, LensModel};
+use crate::calibration::camera::lens::LensModel;
 use crate::calibration::camera::pose::{board_pose, deviation};
 use crate::calibration::camera::refine::{View, calibrate as calibrate_camera};
 use crate::calibration::error::CalibrationError;
+use crate::calibration::oblique::joint::{Angles, Joint, Sighting, State};
 use crate::calibration::oblique::start::{Turned, searched};
 use crate::camera::intrinsics::Pixel;
 use crate::camera::model::CameraModel;
 use crate::camera::oblique::Oblique;
 use crate::geometry::space::{Board, Camera};
 use crate::geometry::transform::Transform;
-use crate::solver::least_squares::{Problem, Settings, Solution, minimize};
+use crate::solver::least_squares::{Problem as _, Settings, Solution, minimize};
 use crate::solver::robust_loss::RobustLoss;
 
 /// Corners farther off than this many deviations are left out.
@@ -40,26 +39,6 @@ const DOUBTFUL_MISFIT: f64 = 0.02;
 const MOST_RMS_PX: f64 = 5.0;
 /// Rotations needed: without given angles two would leave the axis open.
 const LEAST_ROTATIONS: usize = 3;
-
-/// A picture of the board.
-#[derive(Clone, Debug)]
-pub struct Sighting {
-    /// Head and board lay alike in all pictures of a station.
-    pub station: usize,
-    /// The telescope was turned alike in all pictures of a rotation.
-    pub rotation: usize,
-    /// What is seen.
-    pub corners: Vec<BoardCorner>,
-}
-
-/// What is known of the angles.
-#[derive(Clone, Debug)]
-pub struct Angles {
-    /// As told, one for each rotation, rad; none where nobody read it.
-    pub given_rad: Vec<Option<f64>>,
-    /// Their standard deviation, rad.
-    pub sigma_rad: f64,
-}
 
 /// Why there is no joint.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -104,7 +83,7 @@ pub struct Calibration {
     pub oblique: Oblique,
     /// One for each rotation, rad.
     pub angles_rad: Vec<f64>,
-    /// Of the lens's parameters, then: axis (turn about the two directions of [`across`], rad), point (mm along them), centre (px), angles
+    /// Of the lens's parameters, then: axis (turn about the two directions of [`crate::calibration::oblique::joint::across`], rad), point (mm along them), centre (px), angles
     /// of all rotations but the first (rad).
     pub covariance: DMatrix<f64>,
     /// One for each station.
@@ -128,208 +107,6 @@ impl Calibration {
     /// Where the joint's numbers begin in the covariance.
     pub fn first_joint_place(&self) -> usize {
         self.model.names().len()
-    }
-}
-
-/// Two directions across an axis, each a continuous function of it.
-pub fn across(axis: &Unit<Vector3<f64>>) -> [Vector3<f64>; 2] {
-    // Never parallel to an axis that points forward, up to 109° aside.
-    let reference = UnitQuaternion::rotation_between(&Vector3::z(), axis).unwrap_or_else(UnitQuaternion::identity);
-    [reference * Vector3::x(), reference * Vector3::y()]
-}
-
-#[derive(Clone, Debug)]
-struct State {
-    camera: CameraModel,
-    oblique: Oblique,
-    angles: Vec<f64>,
-    boards: Vec<Transform<Camera, Board>>,
-}
-
-impl State {
-    fn seen(
-        &self,
-        camera: &CameraModel,
-        motion: &Transform<Camera, Camera>,
-        station: usize,
-        corner: &BoardCorner,
-    ) -> Option<Pixel> {
-        camera.project(*motion * (*self.boards.get(station)? * corner.board))
-    }
-
-    /// Residual vectors of a sighting, px.
-    fn errors(&self, sighting: &Sighting) -> Vec<Option<[f64; 2]>> {
-        let angle = self.angles.get(sighting.rotation).copied().unwrap_or(0.0);
-        let (camera, motion) = (
-            self.oblique.camera_at(&self.camera, angle),
-            self.oblique.turned_from_zero(angle),
-        );
-        (sighting.corners.iter())
-            .map(|corner| {
-                let seen = self.seen(&camera, &motion, sighting.station, corner)?;
-                Some([seen.x - corner.pixel.x, seen.y - corner.pixel.y])
-            })
-            .collect()
-    }
-}
-
-struct Joint<'a> {
-    model: LensModel,
-    sightings: &'a [Sighting],
-    offsets: Vec<usize>,
-    angles: &'a Angles,
-    /// Rotations and stations.
-    counts: [usize; 2],
-    /// Of the corners, px: what priors are measured by.
-    sigma_px: f64,
-    loss: RobustLoss,
-    scale: f64,
-}
-
-/// Numbers of the axis's direction and point, and of the centre.
-const JOINT: usize = 6;
-
-impl<'a> Joint<'a> {
-    fn new(
-        model: LensModel,
-        sightings: &'a [Sighting],
-        angles: &'a Angles,
-        stations: usize,
-        sigma_px: f64,
-        loss: RobustLoss,
-        scale: f64,
-    ) -> Self {
-        let mut offsets = vec![0];
-        let mut sum = 0;
-        for sighting in sightings {
-            sum += 2 * sighting.corners.len();
-            offsets.push(sum);
-        }
-        Self {
-            model,
-            sightings,
-            offsets,
-            angles,
-            counts: [angles.given_rad.len(), stations],
-            sigma_px,
-            loss,
-            scale,
-        }
-    }
-
-    fn lens(&self) -> usize {
-        self.model.names().len()
-    }
-
-    /// Numbers before the boards'.
-    fn shared(&self) -> usize {
-        self.lens() + JOINT + self.counts[0] - 1
-    }
-}
-
-impl Problem for Joint<'_> {
-    type State = State;
-
-    fn directions(&self) -> usize {
-        self.shared() + 6 * self.counts[1]
-    }
-    fn measured(&self) -> usize {
-        self.offsets.last().copied().unwrap_or(0)
-    }
-    fn priors(&self) -> usize {
-        self.counts[0] - 1
-    }
-    fn loss(&self) -> RobustLoss {
-        self.loss
-    }
-    fn residuals(&self, state: &State, rows: Range<usize>, out: &mut [f64]) {
-        let seen = rows.end.min(self.measured()).saturating_sub(rows.start);
-        let (out, priors) = out.split_at_mut(seen);
-        let first = rows.start.saturating_sub(self.measured());
-        for (number, out) in priors.iter_mut().enumerate() {
-            let rotation = first + number + 1;
-            let off = |given: f64| state.angles.get(rotation).copied().unwrap_or(0.0) - given;
-            let given = self.angles.given_rad.get(rotation).copied().flatten();
-            *out = given.map_or(0.0, |given| off(given) / self.angles.sigma_rad * self.sigma_px);
-        }
-        let mut out = out.iter_mut();
-        for (number, sighting) in self.sightings.iter().enumerate() {
-            let (begin, end) = (self.offsets[number], self.offsets[number + 1]);
-            if end <= rows.start || begin >= rows.end.min(self.measured()) {
-                continue;
-            }
-            let wanted = rows.start.max(begin) - begin..rows.end.min(end) - begin;
-            let errors = state.errors(sighting);
-            let all = errors.iter().flat_map(|error| error.unwrap_or([f64::NAN; 2]));
-            // The errors first: at their end zip has then taken nothing from `out`.
-            for (error, out) in all.skip(wanted.start).take(wanted.len()).zip(out.by_ref()) {
-                *out = error;
-            }
-        }
-    }
-    fn moved(&self, state: &State, step: &[f64]) -> State {
-        let mut moved = state.clone();
-        let (lens_step, rest) = step.split_at(self.lens());
-        let (joint, rest) = rest.split_at(JOINT);
-        let (angles, boards) = rest.split_at(self.counts[0] - 1);
-        for (place, amount) in lens_step.iter().enumerate() {
-            lens::add(&mut moved.camera, self.model, place, *amount);
-        }
-        let [u, v] = across(&state.oblique.axis);
-        let turn = UnitQuaternion::from_scaled_axis(joint[0] * u + joint[1] * v);
-        let axis = Unit::new_normalize(turn * state.oblique.axis.into_inner());
-        let point = state.oblique.point_mm + joint[2] * u + joint[3] * v;
-        moved.oblique = Oblique {
-            axis,
-            point_mm: point - axis.into_inner() * axis.dot(&point),
-            center: Pixel {
-                x: state.oblique.center.x + joint[4],
-                y: state.oblique.center.y + joint[5],
-            },
-        };
-        for (angle, amount) in moved.angles.iter_mut().skip(1).zip(angles) {
-            *angle += amount;
-        }
-        for (board, step) in moved.boards.iter_mut().zip(boards.chunks_exact(6)) {
-            if step.iter().any(|v| *v != 0.0) {
-                *board = board.perturbed_right(&Vector6::from_column_slice(step));
-            }
-        }
-        moved
-    }
-    fn support(&self, direction: usize) -> Vec<Range<usize>> {
-        let rows = |wanted: &dyn Fn(&Sighting) -> bool| -> Vec<Range<usize>> {
-            (self.sightings.iter().enumerate())
-                .filter(|(_, sighting)| wanted(sighting))
-                .map(|(number, _)| self.offsets[number]..self.offsets[number + 1])
-                .collect()
-        };
-        if let Some(board) = direction.checked_sub(self.shared()) {
-            return rows(&|sighting| sighting.station == board / 6);
-        }
-        match direction.checked_sub(self.lens() + JOINT) {
-            Some(angle) => {
-                let mut rows = rows(&|sighting| sighting.rotation == angle + 1);
-                rows.push(self.measured() + angle..self.measured() + angle + 1);
-                rows
-            }
-            None => std::iter::once(0..self.measured()).collect(),
-        }
-    }
-    fn small_step(&self, direction: usize) -> f64 {
-        let joint = self.lens();
-        if direction < joint {
-            return if direction < 4 { 5e-6 * self.scale } else { 5e-6 };
-        }
-        match direction - joint {
-            0 | 1 => 5e-6,
-            2 | 3 => 3e-4,
-            4 | 5 => 5e-6 * self.scale,
-            _ => match direction.checked_sub(self.shared()) {
-                Some(board) if board % 6 < 3 => 3e-4,
-                _ => 5e-6,
-            },
-        }
     }
 }
 
@@ -557,8 +334,13 @@ mod tests {
     use rand_distr::StandardNormal;
     use rayon::prelude::*;
 
+    use nalgebra::{UnitQuaternion, Vector3};
+
     use super::*;
+    use crate::calibration::board::detection::BoardCorner;
     use crate::calibration::board::pattern::BoardLayout;
+    use crate::calibration::camera::lens;
+    use crate::calibration::oblique::joint::across;
     use crate::camera::distortion::Distortion;
     use crate::camera::intrinsics::Intrinsics;
     use crate::geometry::point::Point;

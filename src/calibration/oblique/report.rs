@@ -5,7 +5,8 @@ use std::fmt::Write as _;
 use serde::Serialize;
 
 use crate::calibration::camera::lens;
-use crate::calibration::oblique::refine::{Calibration, Sighting};
+use crate::calibration::oblique::joint::Sighting;
+use crate::calibration::oblique::refine::Calibration;
 
 /// An angle known worse than this is worth a warning, rad.
 const UNSURE_ANGLE: f64 = 0.01;
