@@ -4,18 +4,11 @@
 use crate::calibration::camera::coverage::hull;
 use crate::calibration::camera::cross_validation::Difference;
 use crate::calibration::camera::refine::Calibration;
+use crate::calibration::plot_style::{BACKGROUND, CAPTION, FIELD, GRID, LEFT_OUT, MARGIN, PANEL_WIDTH, WHITE};
 use crate::camera::intrinsics::Pixel;
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::{Canvas, heat};
 
-const PANEL_WIDTH: usize = 800;
-const MARGIN: usize = 12;
-const CAPTION: usize = 34;
-const BACKGROUND: Rgb8 = [24, 24, 28];
-const FIELD: Rgb8 = [44, 44, 50];
-const WHITE: Rgb8 = [235, 235, 235];
-const GRID: Rgb8 = [66, 66, 74];
-const LEFT_OUT: Rgb8 = [255, 60, 200];
 /// Lengths of a drawn arrow per px of residual, the largest that keeps the longest arrow short.
 const MAGNIFICATIONS: [f64; 9] = [1000.0, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0, 5.0, 2.0];
 /// Longest arrow but a few, px in the plot.

@@ -6,14 +6,10 @@ use nalgebra::Matrix3;
 use crate::calibration::color::chart::{COLUMNS, PATCHES, ROWS, place};
 use crate::calibration::color::report::Report;
 use crate::calibration::homography;
+use crate::calibration::plot_style::{BACKGROUND, CAPTION, MARGIN, PANEL_WIDTH, WHITE};
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::Canvas;
 
-const PANEL_WIDTH: usize = 800;
-const MARGIN: usize = 12;
-const CAPTION: usize = 34;
-const BACKGROUND: Rgb8 = [24, 24, 28];
-const WHITE: Rgb8 = [235, 235, 235];
 const OUTLINE: Rgb8 = [60, 255, 120];
 const SHADOW: Rgb8 = [0, 0, 0];
 /// Half of a patch as drawn, in distances of patches.

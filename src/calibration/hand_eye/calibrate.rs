@@ -62,11 +62,10 @@ const SEED: u64 = 1;
 
 /// The stations as arm and picture tell them. Views without a hand are left out.
 pub fn stations(views: &[StationView], hands: &dyn HandPoses) -> Vec<Station> {
-    let offsets = vec![0.0; hands.joints()];
     (views.iter().enumerate())
         .filter_map(|(index, view)| {
             Some(Station {
-                base_from_hand: hands.base_from_hand(index, 0.0, &offsets)?,
+                base_from_hand: hands.as_told(index, 0.0)?,
                 camera_from_board: view.camera_from_board,
             })
         })
@@ -173,24 +172,8 @@ fn predicted(view: &StationView, camera: &CameraModel, camera_from_board: Transf
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibration::hand_eye::example::{Example, Noise};
-    use crate::camera::distortion::Distortion;
-    use crate::camera::intrinsics::Intrinsics;
+    use crate::calibration::hand_eye::example::{Example, Noise, camera};
     use crate::geometry::point::Point;
-
-    fn camera() -> CameraModel {
-        CameraModel {
-            width: 960,
-            height: 540,
-            intrinsics: Intrinsics {
-                fx: 800.0,
-                fy: 800.0,
-                cx: 480.0,
-                cy: 270.0,
-            },
-            distortion: Distortion::None,
-        }
-    }
 
     fn views_of(example: &Example) -> Vec<StationView> {
         let corners: Vec<Point<Board>> = (0..20)

@@ -81,12 +81,11 @@ const SEARCH_WIDTH_RAD: f64 = 0.004;
 
 /// An X to begin with: nothing of it needs to be known.
 pub fn search(pairs: &[ViewPair], hands: &dyn HandPoses) -> Vec<Transform<Hand, Camera>> {
-    let offsets = vec![0.0; hands.joints()];
     // Only pairs some way apart tell much.
     let motions: Vec<(Transform<Hand, Hand>, &ViewPair)> = (pairs.iter())
         .filter(|pair| pair.second - pair.first >= STEPS[1])
         .filter_map(|pair| {
-            let [first, second] = [pair.first, pair.second].map(|view| hands.base_from_hand(view, 0.0, &offsets));
+            let [first, second] = [pair.first, pair.second].map(|view| hands.as_told(view, 0.0));
             Some((second?.inverse() * first?, pair))
         })
         .collect();
@@ -157,7 +156,7 @@ fn misfit(x: &Transform<Hand, Camera>, motions: &[(Transform<Hand, Hand>, &ViewP
 }
 
 /// E of `second_from_first`.
-fn essential(motion: &Transform<Camera, Camera>) -> Matrix3<f64> {
+pub fn essential(motion: &Transform<Camera, Camera>) -> Matrix3<f64> {
     motion.translation().cross_matrix() * motion.rotation().to_rotation_matrix().matrix()
 }
 
@@ -532,27 +531,12 @@ impl Problem for Epipolar<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::calibration::hand_eye::example::{Example, Noise};
-    use crate::camera::distortion::Distortion;
-    use crate::camera::intrinsics::{Intrinsics, Pixel};
+    use crate::calibration::hand_eye::example::{Example, Noise, camera};
+    use crate::camera::intrinsics::Pixel;
     use crate::geometry::point::Point;
     use crate::geometry::space::Board;
 
     const PIXEL_SIGMA: f64 = 0.1;
-
-    fn camera() -> CameraModel {
-        CameraModel {
-            width: 960,
-            height: 540,
-            intrinsics: Intrinsics {
-                fx: 800.0,
-                fy: 800.0,
-                cx: 480.0,
-                cy: 270.0,
-            },
-            distortion: Distortion::None,
-        }
-    }
 
     /// Stations over a bumpy scene of which each place is seen in five views one after the other; the arm's noise is in `noise`.
     fn seen(seed: u64, count: usize, noise: Noise) -> (Example, Vec<FeatureTrack>) {

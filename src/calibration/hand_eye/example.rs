@@ -6,6 +6,9 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 
 use crate::calibration::hand_eye::motion::Station;
+use crate::camera::distortion::Distortion;
+use crate::camera::intrinsics::Intrinsics;
+use crate::camera::model::CameraModel;
 use crate::geometry::space::{Board, Camera, Hand, RobotBase};
 use crate::geometry::transform::Transform;
 
@@ -29,6 +32,21 @@ impl Noise {
         seen_mm: 0.0,
         seen_rad: 0.0,
     };
+}
+
+/// The camera that sees it.
+pub fn camera() -> CameraModel {
+    CameraModel {
+        width: 960,
+        height: 540,
+        intrinsics: Intrinsics {
+            fx: 800.0,
+            fy: 800.0,
+            cx: 480.0,
+            cy: 270.0,
+        },
+        distortion: Distortion::None,
+    }
 }
 
 #[derive(Debug)]

@@ -1,18 +1,11 @@
 //! A picture of a hand-eye calibration: left each station's corners with a line to where the arm alone puts them, right how well each
 //! station is predicted by a calibration on the others.
 
+use crate::calibration::plot_style::{BACKGROUND, CAPTION, FIELD, GRID, LEFT_OUT, MARGIN, PANEL_WIDTH, WHITE};
 use crate::camera::intrinsics::Pixel;
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::{Canvas, heat};
 
-const PANEL_WIDTH: usize = 800;
-const MARGIN: usize = 12;
-const CAPTION: usize = 34;
-const BACKGROUND: Rgb8 = [24, 24, 28];
-const FIELD: Rgb8 = [44, 44, 50];
-const WHITE: Rgb8 = [235, 235, 235];
-const GRID: Rgb8 = [66, 66, 74];
-const OUTLIER: Rgb8 = [255, 60, 200];
 /// Decades of the bars' scale, and where it begins, px.
 const DECADES: f64 = 4.0;
 const FIRST_PX: f64 = 0.01;
@@ -88,7 +81,7 @@ pub fn drawn((width, height): (usize, usize), stations: &[Drawn]) -> Image<Rgb8>
 }
 
 fn color_of(px: f64, worst: f64, outlier: bool) -> Rgb8 {
-    if outlier { OUTLIER } else { heat(px / worst) }
+    if outlier { LEFT_OUT } else { heat(px / worst) }
 }
 
 #[cfg(test)]
@@ -117,7 +110,7 @@ mod tests {
             ],
         );
         assert_eq!(picture.width(), 2 * PANEL_WIDTH + 3 * MARGIN);
-        assert!(picture.pixels().contains(&OUTLIER));
+        assert!(picture.pixels().contains(&LEFT_OUT));
         // Nobody at all.
         assert!(drawn((0, 0), &[]).height() > 0);
     }

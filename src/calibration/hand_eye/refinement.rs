@@ -39,6 +39,11 @@ pub trait HandPoses: Sync {
     fn joints(&self) -> usize {
         0
     }
+
+    /// The hand at a view, its joints taken as told.
+    fn as_told(&self, view: usize, offset_s: f64) -> Option<Transform<RobotBase, Hand>> {
+        self.base_from_hand(view, offset_s, &vec![0.0; self.joints()])
+    }
 }
 
 impl HandPoses for Vec<Transform<RobotBase, Hand>> {
@@ -520,29 +525,13 @@ mod tests {
     use rand_distr::StandardNormal;
 
     use super::*;
-    use crate::calibration::hand_eye::example::{Example, Noise};
+    use crate::calibration::hand_eye::example::{Example, Noise, camera};
     use crate::calibration::hand_eye::method::Method;
     use crate::calibration::hand_eye::motion::Station;
     use crate::calibration::hand_eye::robot_world::board_of;
-    use crate::camera::distortion::Distortion;
-    use crate::camera::intrinsics::Intrinsics;
     use crate::robot::kinematics::{Arm, JointKind};
 
     const PIXEL_SIGMA: f64 = 0.1;
-
-    fn camera() -> CameraModel {
-        CameraModel {
-            width: 960,
-            height: 540,
-            intrinsics: Intrinsics {
-                fx: 800.0,
-                fy: 800.0,
-                cx: 480.0,
-                cy: 270.0,
-            },
-            distortion: Distortion::None,
-        }
-    }
 
     struct Recorded {
         example: Example,

@@ -1,15 +1,11 @@
 //! A picture of a time offset: left how likely each offset is, right the motion of picture and arm over time, laid over each other.
 
+use crate::calibration::plot_style::{BACKGROUND, CAPTION, FIELD, GRID, WHITE};
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::Canvas;
 
 const PANEL: (usize, usize) = (800, 420);
 const MARGIN: usize = 16;
-const CAPTION: usize = 34;
-const BACKGROUND: Rgb8 = [24, 24, 28];
-const FIELD: Rgb8 = [44, 44, 50];
-const GRID: Rgb8 = [66, 66, 74];
-const WHITE: Rgb8 = [235, 235, 235];
 const PICTURE: Rgb8 = [90, 200, 90];
 const ARM: Rgb8 = [240, 170, 60];
 /// Likelihoods lower than the best by more than this say the same: no.

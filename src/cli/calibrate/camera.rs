@@ -1,8 +1,7 @@
 //! `calibrate camera`: intrinsics and lens from pictures of a board.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::Context as _;
 use serde_json::{Value, json};
 
 use crate::calibration::board::detection::{Detection, detect, why_not};
@@ -16,6 +15,7 @@ use crate::calibration::camera::report::{Circumstances, NotFound, Report};
 use crate::calibration::error::{CalibrationError, LEAST_VIEWS};
 use crate::camera::file;
 use crate::cli::calibrate::pictures::{Seen, look_at_all};
+use crate::cli::calibrate::{beside, say_written, write_json};
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
 use crate::image::buffer::{Image, Rgb8};
@@ -161,21 +161,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     write_json(&report_path, &serde_json::to_value(&report)?)?;
     image_files::write(&plot_path, &plot::drawn(&calibration, difference.as_ref()))?;
     console::print(&report.table())?;
-    console::print(&format!(
-        "\nwrote {}, {} and {}\n",
-        args.output.display(),
-        report_path.display(),
-        plot_path.display()
-    ))?;
+    say_written(&[&args.output, &report_path, &plot_path])?;
     Ok(Ended::Complete)
-}
-
-/// `camera.yaml` → `camera_report.json`.
-fn beside(output: &Path, ending: &str) -> PathBuf {
-    let stem = output
-        .file_stem()
-        .map_or_else(|| "camera".into(), |stem| stem.to_string_lossy());
-    output.with_file_name(format!("{stem}{ending}"))
 }
 
 fn same_size<T>(seen: &[Seen<T>]) -> Result<(usize, usize), CalibrationError> {
@@ -221,9 +208,4 @@ fn corners(calibration: &Calibration, names: &[String], board: &str, square_mm: 
         "image_size": [calibration.camera.width, calibration.camera.height],
         "views": views,
     })
-}
-
-fn write_json(path: &Path, value: &Value) -> anyhow::Result<()> {
-    std::fs::write(path, format!("{value:#}\n"))
-        .with_context(|| format!("{}: cannot be written; check folder, rights and space", path.display()))
 }

@@ -157,12 +157,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let plot = plot::drawn(&report, &first.image, &first.found.pixel_from_chart);
     image_files::write(&plot_path, &plot)?;
     console::print(&report.table())?;
-    console::print(&format!(
-        "\nwrote {}, {} and {}\n",
-        args.output.display(),
-        report_path.display(),
-        plot_path.display()
-    ))?;
+    super::say_written(&[&args.output, &report_path, &plot_path])?;
     Ok(Ended::Complete)
 }
 
@@ -286,6 +281,6 @@ fn white(args: &Args, context: &Context, report_path: &Path) -> anyhow::Result<E
         text += "  warning: the target's color changes over the picture; is other light in the room on it?\n";
     }
     console::print(&text)?;
-    console::print(&format!("\nwrote {} and {}\n", args.output.display(), report_path.display()))?;
+    super::say_written(&[&args.output, report_path])?;
     Ok(Ended::Complete)
 }

@@ -134,12 +134,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let drawn = drawn(&refined, &views, &hands, &camera, &report);
     image_files::write(&plot_path, &plot::drawn((camera.width, camera.height), &drawn))?;
     console::print(&report.table())?;
-    console::print(&format!(
-        "\nwrote {}, {} and {}\n",
-        args.output.display(),
-        report_path.display(),
-        plot_path.display()
-    ))?;
+    super::say_written(&[&args.output, &report_path, &plot_path])?;
     Ok(Ended::Complete)
 }
 
@@ -189,7 +184,6 @@ fn matched(
     hands: Hands,
 ) -> (Vec<StationView>, Hands, Vec<String>, Vec<String>) {
     let (mut views, mut kept, mut names, mut without) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
-    let offsets = vec![0.0; hands.joints()];
     for (picture, seen) in seen.iter().enumerate() {
         let Some(detection) = seen
             .found
@@ -203,7 +197,7 @@ fn matched(
             without.push(format!("{} (the board's pose cannot be told)", seen.name));
             continue;
         };
-        if hands.base_from_hand(picture, 0.0, &offsets).is_none() {
+        if hands.as_told(picture, 0.0).is_none() {
             without.push(format!("{} (no pose of the arm)", seen.name));
             continue;
         }

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use nalgebra::Matrix6;
 use serde::Serialize;
 
 use crate::calibration::hand_eye::calibrate::{Held, StationView, leave_out, stations};
@@ -42,16 +43,48 @@ pub struct Compared {
     pub left_out_mm: Option<[f64; 2]>,
 }
 
-/// All figures.
+/// How the camera sits on the hand, and how surely.
 #[derive(Debug, Serialize)]
-pub struct Report {
-    pub version: &'static str,
+pub struct Placement {
     pub translation_mm: [f64; 3],
     pub rotation_xyzw: [f64; 4],
     pub sigma_mm: [f64; 3],
     pub sigma_deg: [f64; 3],
     /// Of the shift (mm) and the rotation vector (rad), in the hand's space.
     pub covariance: [[f64; 6]; 6],
+}
+
+impl Placement {
+    pub fn new(hand_from_camera: &Transform<Hand, Camera>, covariance: &Matrix6<f64>) -> Self {
+        let deviation = |i: usize| covariance[(i, i)].max(0.0).sqrt();
+        let q = hand_from_camera.rotation();
+        Self {
+            translation_mm: hand_from_camera.translation().into(),
+            rotation_xyzw: [q.i, q.j, q.k, q.w],
+            sigma_mm: std::array::from_fn(deviation),
+            sigma_deg: std::array::from_fn(|axis| deviation(axis + 3).to_degrees()),
+            covariance: std::array::from_fn(|row| std::array::from_fn(|column| covariance[(row, column)])),
+        }
+    }
+
+    /// Two lines of a table.
+    pub fn lines(&self) -> String {
+        let ([x, y, z], [sx, sy, sz]) = (self.translation_mm, self.sigma_mm);
+        let ([qx, qy, qz, qw], [rx, ry, rz]) = (self.rotation_xyzw, self.sigma_deg);
+        format!(
+            "  translation   {x:.3} {y:.3} {z:.3} mm  (± {sx:.3} {sy:.3} {sz:.3})
+  rotation      {qx:.5} {qy:.5} {qz:.5} {qw:.5} xyzw  (± {rx:.3} {ry:.3} {rz:.3}°)
+"
+        )
+    }
+}
+
+/// All figures.
+#[derive(Debug, Serialize)]
+pub struct Report {
+    pub version: &'static str,
+    #[serde(flatten)]
+    pub placement: Placement,
     pub base_from_board_mm: [f64; 3],
     pub rms_px: f64,
     pub arm_sigma_mm: f64,
@@ -84,8 +117,7 @@ impl Report {
         };
         let held = leave_out(views, hands, camera, &begun, None);
         let x = refined.hand_from_camera;
-        let q = x.rotation();
-        let deviation = |i: usize| refined.covariance[(i, i)].max(0.0).sqrt();
+        let placement = Placement::new(&x, &refined.covariance);
         let reports: Vec<View> = (names.iter().enumerate())
             .map(|(view, name)| View {
                 name: name.clone(),
@@ -117,17 +149,13 @@ impl Report {
         if views.len() < 8 {
             warnings.push(format!("only {} stations: ten to thirty make the answer sure", views.len()));
         }
-        if (0..3).any(|axis| deviation(axis) > 1.0) {
+        if placement.sigma_mm.iter().any(|sigma| *sigma > 1.0) {
             warnings
                 .push("the camera's place is unsure by more than 1 mm: add stations, tilted farther and about other axes".into());
         }
         Self {
             version: env!("CARGO_PKG_VERSION"),
-            translation_mm: x.translation().into(),
-            rotation_xyzw: [q.i, q.j, q.k, q.w],
-            sigma_mm: std::array::from_fn(deviation),
-            sigma_deg: std::array::from_fn(|axis| deviation(axis + 3).to_degrees()),
-            covariance: std::array::from_fn(|row| std::array::from_fn(|column| refined.covariance[(row, column)])),
+            placement,
             base_from_board_mm: refined.base_from_board.translation().into(),
             rms_px: refined.rms_px,
             arm_sigma_mm: refined.sigmas[0],
@@ -144,17 +172,9 @@ impl Report {
 
     pub fn table(&self) -> String {
         let mut text = String::new();
-        let [x, y, z] = self.translation_mm;
-        let [sx, sy, sz] = self.sigma_mm;
-        let [rx, ry, rz] = self.sigma_deg;
         // Writing to a String cannot fail.
         let _ = writeln!(text, "hand_from_camera, {} stations", self.views.len());
-        let _ = writeln!(text, "  translation   {x:.3} {y:.3} {z:.3} mm  (± {sx:.3} {sy:.3} {sz:.3})");
-        let [qx, qy, qz, qw] = self.rotation_xyzw;
-        let _ = writeln!(
-            text,
-            "  rotation      {qx:.5} {qy:.5} {qz:.5} {qw:.5} xyzw  (± {rx:.3} {ry:.3} {rz:.3}°)"
-        );
+        text += &self.placement.lines();
         if let Some([offset, sigma]) = self.time_offset_ms {
             let _ = writeln!(
                 text,

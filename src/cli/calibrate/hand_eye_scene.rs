@@ -6,17 +6,19 @@ use anyhow::Context as _;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use crate::calibration::hand_eye::epipolar::{FromScene, Settings, ViewPair, pairs, refine, search};
+use crate::calibration::hand_eye::epipolar::{FromScene, Settings, ViewPair, essential, pairs, refine, search};
 use crate::calibration::hand_eye::feature_tracks::{FeatureTrack, FeatureTracker};
 use crate::calibration::hand_eye::motion::{Demands, Station, check};
 use crate::calibration::hand_eye::plot::{self, Drawn};
 use crate::calibration::hand_eye::refinement::HandPoses;
 use crate::camera::model::CameraModel;
 use crate::cli::calibrate::hand_eye::{Args, camera_of};
+use crate::cli::calibrate::hand_eye_report::Placement;
 use crate::cli::calibrate::hands::Hands;
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
 use crate::geometry::point::Point;
+use crate::geometry::space::{Camera, Hand};
 use crate::geometry::transform::Transform;
 use crate::image::pool::Pool;
 use crate::media::image_files;
@@ -38,12 +40,8 @@ const UNSURE_DEG: f64 = 0.3;
 #[derive(Debug, Serialize)]
 struct Report {
     version: &'static str,
-    translation_mm: [f64; 3],
-    rotation_xyzw: [f64; 4],
-    sigma_mm: [f64; 3],
-    sigma_deg: [f64; 3],
-    /// Of the shift (mm) and the rotation vector (rad), in the hand's space.
-    covariance: [[f64; 6]; 6],
+    #[serde(flatten)]
+    placement: Placement,
     time_offset_ms: [f64; 2],
     arm_sigma_mm: f64,
     arm_sigma_deg: f64,
@@ -78,7 +76,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let camera = camera_of(args, Some(&recording))?;
     let (tracks, frames) = followed(&recording, &camera, args.frames as usize, context)?;
     let hands = Hands::of_recording((path, &recording), args.arm.as_deref(), &frames, context)?;
-    let told = |view: usize| hands.base_from_hand(view, 0.0, &vec![0.0; hands.joints()]).is_some();
+    check(&stations(&hands, frames.len()), &Demands::default())?;
+    let told = |view: usize| hands.as_told(view, 0.0).is_some();
     let mut pairs = pairs(&tracks, &camera);
     pairs.retain(|pair| told(pair.first) && told(pair.second));
     anyhow::ensure!(
@@ -102,7 +101,6 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
          scope was not tilted enough for one; survey a still scene with tilts of 20° and more to all sides, or use a board",
         turn_rad.to_degrees()
     );
-    check(&stations(&found, &hands, frames.len()), &Demands::default())?;
     let report = Report::new(&found, &frames, tracks.len(), &pairs);
     let hand_eye = HandEye {
         time_offset: Some(Span::from_seconds(found.time_offset_s[0])),
@@ -114,12 +112,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let drawn = drawn(&found, &pairs, &hands, &camera, frames.len());
     image_files::write(&plot_path, &plot::drawn((camera.width, camera.height), &drawn))?;
     console::print(&report.table())?;
-    console::print(&format!(
-        "\nwrote {}, {} and {}\n",
-        args.output.display(),
-        report_path.display(),
-        plot_path.display()
-    ))?;
+    super::say_written(&[&args.output, &report_path, &plot_path])?;
     Ok(Ended::Complete)
 }
 
@@ -162,18 +155,16 @@ fn followed(
     Ok((tracker.tracks(), frames))
 }
 
-/// Hand and camera at every view, to see whether they moved enough.
-fn stations(found: &FromScene, hands: &Hands, views: usize) -> Vec<Station> {
-    let offsets = vec![0.0; hands.joints()];
+/// Hand and camera at every view, to see whether they moved enough. For that, any place of the camera on the hand and of a board in the
+/// base will do.
+fn stations(hands: &Hands, views: usize) -> Vec<Station> {
+    let hand_from_camera = Transform::<Hand, Camera>::identity();
     (0..views)
         .filter_map(|view| {
-            let base_from_hand = hands.base_from_hand(view, found.time_offset_s[0], &offsets)?;
-            let base_from_camera = base_from_hand * found.hand_from_camera;
-            // Any place of the base will do for a board.
-            let camera_from_board = base_from_camera.inverse() * Transform::identity();
+            let base_from_hand = hands.as_told(view, 0.0)?;
             Some(Station {
                 base_from_hand,
-                camera_from_board,
+                camera_from_board: (base_from_hand * hand_from_camera).inverse() * Transform::identity(),
             })
         })
         .collect()
@@ -181,9 +172,8 @@ fn stations(found: &FromScene, hands: &Hands, views: usize) -> Vec<Station> {
 
 /// Places of each view's first pair, with the nearest place at which the arm's motion alone would let them be.
 fn drawn(found: &FromScene, pairs: &[ViewPair], hands: &Hands, camera: &CameraModel, views: usize) -> Vec<Drawn> {
-    let offsets = vec![0.0; hands.joints()];
     let eye = |view: usize| {
-        let hand = hands.base_from_hand(view, found.time_offset_s[0], &offsets)?;
+        let hand = hands.as_told(view, found.time_offset_s[0])?;
         Some(hand * found.hand_from_camera)
     };
     let pixel = |ray: &Vector3<f64>| camera.project(Point::from_coords(*ray));
@@ -192,7 +182,7 @@ fn drawn(found: &FromScene, pairs: &[ViewPair], hands: &Hands, camera: &CameraMo
             let pair = pairs.iter().find(|pair| pair.second == view);
             let motion = pair.and_then(|pair| Some(eye(pair.second)?.inverse() * eye(pair.first)?));
             let corners = pair.zip(motion).into_iter().flat_map(|(pair, motion)| {
-                let essential = motion.translation().cross_matrix() * motion.rotation().to_rotation_matrix().matrix();
+                let essential = essential(&motion);
                 pair.rays.iter().filter_map(move |[from, to]| {
                     let line = essential * from;
                     let away = to.dot(&line) / (line.x * line.x + line.y * line.y).max(1e-24);
@@ -212,18 +202,14 @@ fn drawn(found: &FromScene, pairs: &[ViewPair], hands: &Hands, camera: &CameraMo
 
 impl Report {
     fn new(found: &FromScene, frames: &[u64], tracks: usize, pairs: &[ViewPair]) -> Self {
-        let deviation = |i: usize| found.covariance[(i, i)].max(0.0).sqrt();
-        let x = found.hand_from_camera;
-        let q = x.rotation();
-        let sigma_mm: [f64; 3] = std::array::from_fn(deviation);
-        let sigma_deg: [f64; 3] = std::array::from_fn(|axis| deviation(axis + 3).to_degrees());
+        let placement = Placement::new(&found.hand_from_camera, &found.covariance);
         let mut warnings = Vec::new();
-        if sigma_mm.iter().any(|sigma| *sigma > UNSURE_MM) {
+        if placement.sigma_mm.iter().any(|sigma| *sigma > UNSURE_MM) {
             warnings.push(format!(
                 "the camera's place is unsure by more than {UNSURE_MM} mm: tilt the scope farther and to all sides, or use a board"
             ));
         }
-        if sigma_deg.iter().any(|sigma| *sigma > UNSURE_DEG) {
+        if placement.sigma_deg.iter().any(|sigma| *sigma > UNSURE_DEG) {
             warnings.push(format!(
                 "the camera's rotation is unsure by more than {UNSURE_DEG}°: move and tilt farther, or use a board"
             ));
@@ -231,11 +217,7 @@ impl Report {
         let views = frames.iter().zip(&found.predicted_px).zip(&found.corrections);
         Self {
             version: env!("CARGO_PKG_VERSION"),
-            translation_mm: x.translation().into(),
-            rotation_xyzw: [q.i, q.j, q.k, q.w],
-            sigma_mm,
-            sigma_deg,
-            covariance: std::array::from_fn(|row| std::array::from_fn(|column| found.covariance[(row, column)])),
+            placement,
             time_offset_ms: found.time_offset_s.map(|s| 1000.0 * s),
             arm_sigma_mm: found.sigmas[0],
             arm_sigma_deg: found.sigmas[1].to_degrees(),
@@ -256,14 +238,10 @@ impl Report {
     }
 
     fn table(&self) -> String {
-        let ([x, y, z], [sx, sy, sz]) = (self.translation_mm, self.sigma_mm);
-        let ([qx, qy, qz, qw], [rx, ry, rz]) = (self.rotation_xyzw, self.sigma_deg);
         let [offset, sigma] = self.time_offset_ms;
         let mut text = format!(
             "hand_from_camera, {} views of a scene without a board: {} tracks, {} pairs of views
-  translation   {x:.3} {y:.3} {z:.3} mm  (± {sx:.3} {sy:.3} {sz:.3})
-  rotation      {qx:.5} {qy:.5} {qz:.5} {qw:.5} xyzw  (± {rx:.3} {ry:.3} {rz:.3}°)
-  time offset   {offset:.1} ms  (± {sigma:.1}), added to the arm's stamps
+{}  time offset   {offset:.1} ms  (± {sigma:.1}), added to the arm's stamps
   arm's noise   {:.3} mm, {:.4}° a view; tracks {:.3} px; RMS {:.3} px with the views corrected
 
   frame   arm alone  correction
@@ -271,6 +249,7 @@ impl Report {
             self.views.len(),
             self.tracks,
             self.pairs,
+            self.placement.lines(),
             self.arm_sigma_mm,
             self.arm_sigma_deg,
             self.track_sigma_px,

@@ -19,6 +19,7 @@ use std::path::{Path, PathBuf};
 use anyhow::Context as _;
 use clap::Subcommand;
 
+use crate::cli::console;
 use crate::cli::context::{Context, Ended};
 
 /// Measure camera, arm, clocks and colors.
@@ -68,4 +69,14 @@ fn beside(output: &Path, ending: &str) -> PathBuf {
 fn write_json(path: &Path, value: &serde_json::Value) -> anyhow::Result<()> {
     std::fs::write(path, format!("{value:#}\n"))
         .with_context(|| format!("{}: cannot be written; check folder, rights and space", path.display()))
+}
+
+/// The last line of a calibration: what lies where.
+fn say_written(paths: &[&Path]) -> anyhow::Result<()> {
+    let names: Vec<String> = paths.iter().map(|path| path.display().to_string()).collect();
+    let listed = match names.split_last() {
+        Some((last, before)) if !before.is_empty() => format!("{} and {last}", before.join(", ")),
+        _ => names.concat(),
+    };
+    console::print(&format!("\nwrote {listed}\n"))
 }

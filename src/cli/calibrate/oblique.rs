@@ -163,7 +163,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     file::write_oblique(&args.output, &calibration.camera, &calibration.oblique, "endofield")?;
     super::write_json(&report_path, &serde_json::to_value(&report)?)?;
     console::print(&report.table())?;
-    console::print(&format!("\nwrote {} and {}\n", args.output.display(), report_path.display()))?;
+    super::say_written(&[&args.output, &report_path])?;
     Ok(Ended::Complete)
 }
 

@@ -67,7 +67,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let report = Report::new(&pivot(&poses, outliers)?, names, args.leave_out_outliers);
     super::write_json(&args.output, &serde_json::to_value(&report)?)?;
     console::print(&report.table())?;
-    console::print(&format!("\nwrote {}\n", args.output.display()))?;
+    super::say_written(&[&args.output])?;
     Ok(Ended::Complete)
 }
 
