@@ -7,16 +7,20 @@ use std::sync::Arc;
 
 use crate::camera::model::CameraModel;
 use crate::config::Config;
+use crate::light_field::build::BuildSettings;
 use crate::light_field::view::LightField;
+use crate::pipeline::slot::Slot;
 use crate::pipeline::stage::Stage;
+use crate::progress::Silent;
 use crate::recording::folder::Recording;
 use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::color_normalization::color_file::ColorFile;
 use crate::stages::color_normalization::stage::ColorNormalization;
-use crate::stages::pose_refinement::PoseRefinement;
+use crate::stages::pose_refinement::{PoseRefinement, Reference};
 use crate::stages::pose_stamping::PoseStamping;
+use crate::stages::rolling_light_field::{Maker, RollingLightField};
 use crate::stages::specularity_detection::SpecularityDetection;
-use crate::stages::specularity_substitution::stage::SpecularitySubstitution;
+use crate::stages::specularity_substitution::stage::{SpecularitySubstitution, Witnesses};
 use crate::stages::temporal_median::stage::TemporalMedian;
 use crate::stages::undistortion::{self, Undistortion};
 use crate::stages::{color_normalization, temporal_median};
@@ -168,8 +172,13 @@ pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Re
 fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line: &mut Line) -> Result<(), ComposeError> {
     let recording = equipment.recording;
     let only_marked = "specularities are only found and marked 64 in the mask";
-    let lacking = if equipment.light_field.is_none() {
-        Some("no light field (--light-field LF)")
+    let rolls = config.rolling.enabled && recording.trajectory.is_some() && recording.hand_eye.is_some();
+    let lacking = if equipment.light_field.is_none() && !rolls {
+        Some(if config.rolling.enabled {
+            "no light field (--light-field LF), nor poses and hand_eye.yaml to make one of the video's own frames"
+        } else {
+            "no light field (--light-field LF)"
+        })
     } else if recording.camera.is_none() {
         Some("no camera.yaml beside the video")
     } else if !wanted.contains(&Choice::Undistort) {
@@ -178,20 +187,20 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
         None
     };
     line.stages.push(Box::new(SpecularityDetection::new(&config.specularity)));
-    let Some(light_field) = equipment.light_field.as_ref().filter(|_| lacking.is_none()) else {
-        if let Some(lacking) = lacking {
-            line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
-        }
+    if let Some(lacking) = lacking {
+        line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
         line.stages
             .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
         return Ok(());
-    };
+    }
+    let light_field = equipment.light_field.as_ref();
     match (&recording.trajectory, &recording.hand_eye) {
         (Some(trajectory), Some(hand_eye)) => {
             let poses = PoseBuffer::from_trajectory(trajectory, &config.poses)?;
             let mut stamping = PoseStamping::new(poses, hand_eye.clone());
-            if hand_eye.time_offset.is_none() && light_field.time_offset != Span(0) {
-                stamping = stamping.with_time_offset(light_field.time_offset);
+            let of_survey = light_field.map_or(Span(0), |light_field| light_field.time_offset);
+            if hand_eye.time_offset.is_none() && of_survey != Span(0) {
+                stamping = stamping.with_time_offset(of_survey);
             }
             line.stages.push(Box::new(stamping));
         }
@@ -203,13 +212,50 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
             );
         }
     }
-    line.stages.push(Box::new(PoseRefinement::new(
-        &config.pose_refinement,
-        Arc::clone(light_field),
-    )));
-    line.stages.push(Box::new(SpecularitySubstitution::new(
-        &config.substitution,
-        Some(Arc::clone(light_field)),
-    )));
+    match light_field {
+        Some(light_field) => {
+            line.stages.push(Box::new(PoseRefinement::new(
+                &config.pose_refinement,
+                Arc::clone(light_field),
+            )));
+            line.stages.push(Box::new(SpecularitySubstitution::new(
+                &config.substitution,
+                Some(Arc::clone(light_field)),
+            )));
+        }
+        None => rolling(config, line),
+    }
     Ok(())
+}
+
+/// The stages that make a light field of the video's own last frames, and use it.
+fn rolling(config: &Config, line: &mut Line) {
+    let (reference, witnesses) = (Slot::new(), Slot::new());
+    let maker = made_at_once(config, reference.clone(), witnesses.clone());
+    line.stages.push(Box::new(RollingLightField::new(&config.rolling, maker)));
+    line.stages
+        .push(Box::new(PoseRefinement::awaiting(&config.pose_refinement, reference)));
+    line.stages
+        .push(Box::new(SpecularitySubstitution::awaiting(&config.substitution, witnesses)));
+}
+
+/// Makes each light field before the frame that called for it goes on: on a recording nothing hurries, and every run is alike.
+fn made_at_once(config: &Config, reference: Slot<Reference>, witnesses: Slot<Witnesses>) -> Maker {
+    let (trust, alignment) = (config.survey.clone(), config.pose_refinement.clone());
+    let mut told = false;
+    Box::new(
+        move |batch, camera| match batch.built(camera, &trust, &BuildSettings::default(), &Silent) {
+            Ok(light_field) => {
+                tracing::debug!("a light field of {} of the last frames", light_field.views.len());
+                let light_field = Arc::new(light_field);
+                reference.put(Reference::new(Arc::clone(&light_field), &alignment));
+                witnesses.put(Witnesses::new(light_field));
+            }
+            Err(error) if !told => {
+                told = true;
+                tracing::warn!("specular: no light field could be made of the last frames, a later one may: {error}");
+            }
+            Err(_) => {}
+        },
+    )
 }

@@ -11,6 +11,7 @@ use toml::{Table, Value};
 
 use crate::image::{field_of_view, specularity};
 use crate::light_field::prior::PriorSettings;
+use crate::light_field::rolling;
 use crate::robot::feed;
 use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::{color_normalization, pose_refinement, specularity_substitution, temporal_median, undistortion};
@@ -137,6 +138,8 @@ pub struct Config {
     pub poses: pose_buffer::Settings,
     /// How far a survey's poses are trusted while a light field is built.
     pub survey: PriorSettings,
+    /// The light field of the video's own last frames.
+    pub rolling: rolling::Settings,
     /// The arm's pose corrected by the picture.
     pub pose_refinement: pose_refinement::Settings,
     /// How specularities are replaced.
@@ -216,6 +219,7 @@ impl Config {
         PoseBuffer::new(&self.poses).map(|_| ()).map_err(|error| error.to_string())?;
         self.arm.check()?;
         self.survey.check()?;
+        self.rolling.check()?;
         // Amounts, reaches and shares: none of them can be negative, and no setting at all can be infinite or no number.
         let tree = Table::try_from(self).map_err(|error| error.to_string())?;
         for (group, settings) in &tree {

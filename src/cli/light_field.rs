@@ -22,9 +22,9 @@ use crate::light_field::file;
 use crate::light_field::prior::PriorSettings;
 use crate::light_field::renderer::Renderer;
 use crate::light_field::selection::{SelectionSettings, ViewCandidate, select_views, sharpness};
-use crate::light_field::survey::{self, PosePrior, SurveyFrame};
+use crate::light_field::survey::{self, PosePrior};
 use crate::light_field::survey_report::SurveyReport;
-use crate::light_field::view::{LightField, SparsePoint, View};
+use crate::light_field::view::{LightField, View};
 use crate::media::reader::{Input, VideoReader};
 use crate::progress::Progress;
 use crate::recording::folder::{Recording, Video};
@@ -246,7 +246,7 @@ fn from_recording(
 
     let began = MonotonicClock.now();
     progress.begin("undistort, find specularities", pictures.len() as u64);
-    let mut prepared: Vec<View> = (pictures.par_iter())
+    let prepared: Vec<View> = (pictures.par_iter())
         .map(|(number, exposed_at, image)| {
             let stamp = *exposed_at - known_offset.unwrap_or_default();
             let pose = arm.world_from_camera(stamp).unwrap_or_else(Transform::identity);
@@ -259,58 +259,33 @@ fn from_recording(
     seconds.undistort_and_detect_s = since(began);
 
     let began = MonotonicClock.now();
-    let (points, report, time_offset) = if refine {
-        let frames: Vec<SurveyFrame> = (prepared.iter())
-            .map(|view| SurveyFrame {
-                frame_number: view.frame_number,
-                image: view.image.clone(),
-                confidence: view.confidence.clone(),
-                exposed_at: view.exposed_at,
-            })
-            .collect();
+    let (mut light_field, report) = if refine {
         let settings = survey::Settings {
             known_time_offset_ms: known_offset.map(|o| o.milliseconds()),
             ..Default::default()
         };
-        let refined = survey::refine(&frames, &camera.pinhole(), &arm, &settings, progress)?;
-        let mut kept = Vec::with_capacity(prepared.len());
-        for (mut view, pose) in prepared.into_iter().zip(&refined.world_from_camera) {
-            if let Some(pose) = pose {
-                view.world_from_camera = *pose;
-                kept.push(view);
-            }
-        }
-        prepared = kept;
-        let points = refined
-            .points
-            .into_iter()
-            .map(|p| SparsePoint {
-                position: p.position,
-                observations: p.observations,
-            })
-            .collect();
-        (points, Some(refined.report), refined.time_offset)
+        let (refined, report) = build::refined(prepared, &camera.pinhole(), &arm, &settings, progress)?;
+        (refined, Some(report))
     } else {
-        (Vec::new(), None, known_offset.unwrap_or_default())
+        let unrefined = LightField {
+            views: prepared,
+            time_offset: known_offset.unwrap_or_default(),
+            ..LightField::default()
+        };
+        (unrefined, None)
     };
     seconds.refine_s = since(began);
 
     let began = MonotonicClock.now();
-    let mut light_field = LightField {
-        views: prepared,
-        points,
-        time_offset,
-        recipe: format!(
-            "survey {}, {}",
-            source.display(),
-            if refine {
-                "poses refined by the pictures"
-            } else {
-                "the arm's poses"
-            }
-        ),
-        ..LightField::default()
-    };
+    light_field.recipe = format!(
+        "survey {}, {}",
+        source.display(),
+        if refine {
+            "poses refined by the pictures"
+        } else {
+            "the arm's poses"
+        }
+    );
     let surface = build::complete(&mut light_field, &BuildSettings::default(), progress)?;
     seconds.depth_and_surface_s = since(began);
     let report = BuildReport {

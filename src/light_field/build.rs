@@ -16,10 +16,13 @@ use crate::light_field::depth::stereo::{DepthMap, Stereo, StereoSettings, confir
 use crate::light_field::error::LightFieldError;
 use crate::light_field::file::{self, Origin};
 use crate::light_field::photometry;
+use crate::light_field::prior::PosePrior;
 use crate::light_field::rasterize::DepthRasterizer;
 use crate::light_field::surface::{SurfaceSettings, fuse};
+use crate::light_field::survey::{self, SurveyError, SurveyFrame};
+use crate::light_field::survey_report::SurveyReport;
 use crate::light_field::undistort::undistorted;
-use crate::light_field::view::{LightField, View};
+use crate::light_field::view::{LightField, SparsePoint, View};
 use crate::progress::Progress;
 use crate::time::Timestamp;
 
@@ -71,6 +74,41 @@ pub fn view_of(
         gain: [1.0; 3],
         exposed_at,
     }
+}
+
+/// Views whose poses are the arm's become a light field whose poses fit the pictures; what the pictures do not tie in is left out. Depth and
+/// surface are still to come ([`complete`]). The camera is the undistorted pictures' own.
+pub fn refined(
+    views: Vec<View>,
+    camera: &CameraModel,
+    prior: &dyn PosePrior,
+    settings: &survey::Settings,
+    progress: &dyn Progress,
+) -> Result<(LightField, SurveyReport), SurveyError> {
+    let frames: Vec<SurveyFrame> = (views.iter())
+        .map(|view| SurveyFrame {
+            frame_number: view.frame_number,
+            image: view.image.clone(),
+            confidence: view.confidence.clone(),
+            exposed_at: view.exposed_at,
+        })
+        .collect();
+    let found = survey::refine(&frames, camera, prior, settings, progress)?;
+    let tied = |(mut view, pose): (View, &Option<Transform<World, Camera>>)| {
+        view.world_from_camera = (*pose)?;
+        Some(view)
+    };
+    let points = (found.points.into_iter()).map(|point| SparsePoint {
+        position: point.position,
+        observations: point.observations,
+    });
+    let light_field = LightField {
+        views: views.into_iter().zip(&found.world_from_camera).filter_map(tied).collect(),
+        points: points.collect(),
+        time_offset: found.time_offset,
+        ..LightField::default()
+    };
+    Ok((light_field, found.report))
 }
 
 /// Opens a light field folder; a COLMAP model made elsewhere gets its confidence, depth, surface and gains now, in memory.

@@ -22,7 +22,7 @@ use crate::light_field::colmap::{ColmapImage, ColmapModel, ColmapPoint, model_fo
 use crate::light_field::error::LightFieldError;
 use crate::light_field::ply::{self, PlyEncoding};
 use crate::light_field::undistort::undistorted;
-use crate::light_field::view::{LampShading, LightField, SparsePoint, View};
+use crate::light_field::view::{Kind, LampShading, LightField, SparsePoint, View};
 use crate::progress::Progress;
 use crate::time::{Span, Timestamp};
 
@@ -172,6 +172,7 @@ pub fn read(folder: &Path, progress: &dyn Progress) -> Result<Loaded, LightField
             points,
             shading,
             recipe,
+            kind: Kind::Survey,
         },
         origin,
     })

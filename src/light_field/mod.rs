@@ -18,6 +18,7 @@ pub mod rasterize;
 pub mod refinement;
 pub mod renderer;
 pub mod reobservation;
+pub mod rolling;
 pub mod selection;
 pub mod surface;
 pub mod survey;

@@ -30,6 +30,10 @@ const MIN_POINTS: usize = 20;
 const LEVELS: usize = 4;
 /// Residuals above this many robust standard deviations leave the adjustment.
 const OUTLIER_SIGMAS: f64 = 4.0;
+/// Mean cube of correlations at one depth from which on the poses need no other clock.
+const PLAIN_AGREEMENT: f64 = 0.3;
+/// Clocks are tried in such steps, ms: the picture of a fast scope moves a corner's width meanwhile.
+const OFFSET_STEP_MS: f64 = 20.0;
 /// The priors stay this loose along the path, ms.
 const MIN_OFFSET_DOUBT_MS: f64 = 3.0;
 /// A reprojection error above this tells that the tissue moved, px.
@@ -120,9 +124,8 @@ impl<'a> Refinement<'a> {
         };
         progress.begin("tracking", (self.frames.len() / anchor_step) as u64);
         let mut features = {
+            let depth = self.first_look(&choice)?;
             let views = self.views();
-            let depth = common_depth(&views, &choice).ok_or(SurveyError::NoParallax)?;
-            tracing::debug!(depth, "common depth");
             let tracks = tracks(&views, depth, &choice, &|| progress.advance(1));
             let keep_every = (tracks.len() as f64 / self.settings.max_points.max(MIN_POINTS) as f64).max(1.0);
             let mut next = 0.0;
@@ -166,6 +169,36 @@ impl<'a> Refinement<'a> {
         progress.end();
         self.check(&features, progress)?;
         Ok(self.result(&features))
+    }
+
+    /// The depth at which the pictures agree; where they hardly do at the offset known so far, with the clocks so far apart that they do.
+    fn first_look(&mut self, choice: &TrackingChoice) -> Result<f64, SurveyError> {
+        let mut best = common_depth(&self.views(), choice);
+        let known = self.offset.offset;
+        let range = self.settings.time_offset_range_ms;
+        let tried = (1..)
+            .map(|step| f64::from(step) * OFFSET_STEP_MS)
+            .take_while(|ms| *ms <= range)
+            .flat_map(|ms| [-ms, ms]);
+        for ms in tried {
+            if best.is_some_and(|best| best.agreement >= PLAIN_AGREEMENT) {
+                break;
+            }
+            let offset = Span(known.0 + Span::from_milliseconds(ms).0);
+            let (poses, _) = initial_poses(self.frames, self.prior, self.settings, offset)?;
+            let views = Views {
+                poses: &poses,
+                ..self.views()
+            };
+            let found = common_depth(&views, choice);
+            if found.map_or(0.0, |found| found.agreement) > best.map_or(0.0, |best| best.agreement) {
+                best = found;
+                self.poses = poses;
+                self.offset.offset = offset;
+            }
+        }
+        tracing::debug!(?best, offset_ms = self.offset.offset.milliseconds(), "first look");
+        best.map(|best| best.depth).ok_or(SurveyError::NoParallax)
     }
 
     fn views(&self) -> Views<'_> {

@@ -73,11 +73,37 @@ impl Views<'_> {
     }
 }
 
+/// A depth at which pictures some views apart look alike.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct CommonDepth {
+    /// mm.
+    pub depth: f64,
+    /// Mean cube of the corners' correlation at it, 0–1.
+    pub agreement: f64,
+}
+
+/// Views are compared so many apart, the farthest first: depth shows more the farther, but a fast scope has left the place by then.
+const GAPS: [usize; 5] = [6, 4, 3, 2, 1];
+/// A wider gap is preferred to a narrower one that agrees a little better.
+const PREFERENCE: f64 = 0.8;
+
 /// The depth at which corners agree best; `None` if the camera does not move or nothing fits.
-pub(crate) fn common_depth(views: &Views<'_>, choice: &TrackingChoice) -> Option<f64> {
+pub(crate) fn common_depth(views: &Views<'_>, choice: &TrackingChoice) -> Option<CommonDepth> {
     let n = views.poses.len();
-    // Pairs apart enough that depth matters and near enough that they look alike.
-    let gap = (n / 10).clamp(1, 6);
+    let mut best: Option<CommonDepth> = None;
+    for gap in GAPS.into_iter().filter(|gap| *gap <= (n / 10).max(1)) {
+        let found = depth_across(views, gap, choice);
+        if let Some(found) = found
+            && best.is_none_or(|best| PREFERENCE * found.agreement > best.agreement)
+        {
+            best = Some(found);
+        }
+    }
+    best
+}
+
+fn depth_across(views: &Views<'_>, gap: usize, choice: &TrackingChoice) -> Option<CommonDepth> {
+    let n = views.poses.len();
     let pairs: Vec<(usize, usize)> = (0..n.saturating_sub(gap))
         .step_by((n / 10).max(1))
         .map(|i| (i, i + gap))
@@ -89,7 +115,7 @@ pub(crate) fn common_depth(views: &Views<'_>, choice: &TrackingChoice) -> Option
         return None;
     }
     let depths: Vec<f64> = (0..DEPTH_STEPS).map(|k| typical * 2.0 * 1.14f64.powi(k as i32)).collect();
-    let votes: Vec<Vec<f64>> = pairs
+    let votes: Vec<(usize, Vec<f64>)> = pairs
         .par_iter()
         .map(|(a, b)| {
             let level = views.pyramids[*a].levels.len().saturating_sub(2);
@@ -120,14 +146,20 @@ pub(crate) fn common_depth(views: &Views<'_>, choice: &TrackingChoice) -> Option
                     *vote += f64::from(zncc.unwrap_or(0.0).max(0.0)).powi(3);
                 }
             }
-            votes
+            (found.len(), votes)
         })
         .collect();
-    let sums: Vec<f64> = (0..DEPTH_STEPS).map(|k| votes.iter().map(|v| v[k]).sum()).collect();
+    let corners: usize = votes.iter().map(|(corners, _)| corners).sum();
+    let sums: Vec<f64> = (0..DEPTH_STEPS)
+        .map(|k| votes.iter().map(|(_, votes)| votes[k]).sum())
+        .collect();
     // A little smoothing: neighbouring depths support each other.
     let smooth = |k: usize| sums[k] + 0.5 * (sums[k.saturating_sub(1)] + sums[(k + 1).min(DEPTH_STEPS - 1)]);
     let best = (0..DEPTH_STEPS).max_by(|a, b| smooth(*a).total_cmp(&smooth(*b)))?;
-    (sums[best] > 0.0).then(|| depths[best])
+    (sums[best] > 0.0).then(|| CommonDepth {
+        depth: depths[best],
+        agreement: sums[best] / corners.max(1) as f64,
+    })
 }
 
 fn baseline(views: &Views<'_>, a: usize, b: usize) -> f64 {

@@ -65,6 +65,16 @@ impl LampShading {
     }
 }
 
+/// Where the views come from.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Kind {
+    /// A survey, made before.
+    #[default]
+    Survey,
+    /// The video's own last frames.
+    Rolling,
+}
+
 /// Posed views over a surface.
 #[derive(Clone, Debug, Default)]
 pub struct LightField {
@@ -80,4 +90,6 @@ pub struct LightField {
     pub shading: LampShading,
     /// What made it, for people.
     pub recipe: String,
+    /// Where the views come from.
+    pub kind: Kind,
 }

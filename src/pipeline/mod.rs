@@ -12,6 +12,7 @@ pub mod control;
 pub mod outcome;
 pub mod queue;
 pub mod runner;
+pub mod slot;
 pub mod stage;
 pub mod timing;
 mod worker;

@@ -12,6 +12,7 @@ use crate::image::blur::BlurScratch;
 use crate::light_field::view::LightField;
 use crate::localization::detail::{DetailPyramid, Usable};
 use crate::localization::image_alignment::{self, ImageAligner};
+use crate::pipeline::slot::Slot;
 use crate::pipeline::stage::{Stage, StageError};
 
 /// How far the picture may overrule the arm.
@@ -36,12 +37,30 @@ impl Default for Settings {
     }
 }
 
+/// A light field, made ready for pictures to be laid against it.
+#[derive(Debug)]
+pub struct Reference {
+    light_field: Arc<LightField>,
+    aligner: ImageAligner,
+}
+
+impl Reference {
+    /// The work of all views' pictures: not for a running line's thread.
+    pub fn new(light_field: Arc<LightField>, settings: &Settings) -> Self {
+        Self {
+            aligner: ImageAligner::new(&light_field, &settings.alignment),
+            light_field,
+        }
+    }
+}
+
 /// Corrects `frame.world_from_camera`.
 #[derive(Debug)]
 pub struct PoseRefinement {
     settings: Settings,
-    light_field: Arc<LightField>,
-    aligner: ImageAligner,
+    reference: Option<Reference>,
+    /// Where a newer light field comes.
+    newer: Slot<Reference>,
     pyramid: DetailPyramid,
     scratch: BlurScratch,
     /// Right-multiplied to the arm's pose: refined = arm · correction.
@@ -53,9 +72,17 @@ impl PoseRefinement {
     /// Against the given light field.
     pub fn new(settings: &Settings, light_field: Arc<LightField>) -> Self {
         Self {
+            reference: Some(Reference::new(light_field, settings)),
+            ..Self::awaiting(settings, Slot::new())
+        }
+    }
+
+    /// No frame is aligned until a light field comes; every newer one is taken from then on.
+    pub fn awaiting(settings: &Settings, newer: Slot<Reference>) -> Self {
+        Self {
             settings: settings.clone(),
-            aligner: ImageAligner::new(&light_field, &settings.alignment),
-            light_field,
+            reference: None,
+            newer,
             pyramid: DetailPyramid::default(),
             scratch: BlurScratch::default(),
             correction: None,
@@ -64,20 +91,26 @@ impl PoseRefinement {
     }
 
     /// The best start among the arm's pose, that pose with the last correction, and the last pose.
-    fn best_guess(&mut self, frame: &Frame, camera: &crate::camera::model::CameraModel) -> Option<Transform<World, Camera>> {
+    fn best_guess(
+        &self,
+        reference: &mut Reference,
+        frame: &Frame,
+        camera: &crate::camera::model::CameraModel,
+    ) -> Option<Transform<World, Camera>> {
+        let Reference { light_field, aligner } = reference;
         let prior = frame.world_from_camera;
         let corrected = prior.zip(self.correction).map(|(arm, correction)| arm * correction);
         let mut best: Option<(f32, Transform<World, Camera>)> = None;
         for pose in [corrected, prior, self.last].into_iter().flatten() {
-            let score = self.aligner.coarse_score(&self.pyramid, camera, &pose);
+            let score = aligner.coarse_score(&self.pyramid, camera, &pose);
             if best.is_none_or(|(found, _)| score > found) {
                 best = Some((score, pose));
             }
         }
         if best.is_none_or(|(score, _)| score < 0.1) && prior.is_none() {
-            for index in 0..self.light_field.views.len() {
-                let pose = self.light_field.views[index].world_from_camera;
-                let score = self.aligner.coarse_score(&self.pyramid, camera, &pose);
+            for view in &light_field.views {
+                let pose = view.world_from_camera;
+                let score = aligner.coarse_score(&self.pyramid, camera, &pose);
                 if best.is_none_or(|(found, _)| score > found) {
                     best = Some((score, pose));
                 }
@@ -122,15 +155,23 @@ impl Stage for PoseRefinement {
                 "no specularity mask: the detection stage must run before the pose refinement".into(),
             ));
         };
+        if let Some(newer) = self.newer.take() {
+            self.reference = Some(newer);
+        }
+        let Some(mut reference) = self.reference.take() else {
+            frame.alignment = Some(Alignment::default());
+            return Ok(());
+        };
         let step = analysis.step;
         let camera = camera.reduced(step);
         self.pyramid
             .build(analysis.image(&frame.image), &usable_in(analysis), &mut self.scratch);
         let prior = frame.world_from_camera;
-        let aligned = self
-            .best_guess(frame, &camera)
-            .and_then(|guess| self.aligner.align(&self.pyramid, &camera, &guess, prior.as_ref()))
+        let guess = self.best_guess(&mut reference, frame, &camera);
+        let aligned = guess
+            .and_then(|guess| reference.aligner.align(&self.pyramid, &camera, &guess, prior.as_ref()))
             .filter(|found| self.is_believable(&found.world_from_camera, prior.as_ref()));
+        self.reference = Some(reference);
         let Some(found) = aligned else {
             frame.alignment = Some(Alignment::default());
             self.last = None;

@@ -45,7 +45,7 @@ impl Default for Settings {
             core_max_width_px: 36.0,
             whiteness: 0.72,
             core_whiteness: 1.0,
-            max_region_share: 0.012,
+            max_region_share: 0.03,
             steel_saturation: 0.2,
             steel_min_share: 0.004,
         }

@@ -1,11 +1,12 @@
 //! Instruments: connected grey areas that are dark or of much contrast, what is nearly grey and hangs together with them, and a margin.
 //!
-//! A pale organ is grey as well, but evenly lit; polished steel mirrors bright and dark side by side. Its jaws and edges mix with the
-//! colours around: they are followed from the shaft.
+//! A pale organ is grey as well, but evenly lit and never quite without colour; polished steel mirrors bright and dark side by side. The
+//! lamp's image on tissue is as grey and as uneven, but instruments come in from the rim. Jaws and edges mix with the colours around:
+//! they are followed from the shaft.
 
 use crate::image::blur::{BlurScratch, box_blur};
 use crate::image::buffer::{Image, Mask};
-use crate::image::components::Components;
+use crate::image::components::{Components, Region};
 use crate::image::distance::{UNITS_PER_PX, chamfer_distance};
 use crate::image::specularity::cells::Cells;
 use crate::image::specularity::settings::{CELLS_ACROSS, Settings};
@@ -17,8 +18,14 @@ const MIN_GREY_SHARE: f32 = 0.75;
 /// Steel shines and mirrors the dark: the standard deviation of a region over its mean is at least this. On a real operation shafts have
 /// 0.26 to 0.41, pale gall bladders up to 0.16.
 const MIN_CONTRAST: f32 = 0.2;
+/// Steel has no colour, however evenly lit: half a shaft's cells have a saturation of 0 to 0.06, of pale gall bladders 0.12 to 0.15.
+const NEUTRAL_SATURATION: f32 = 0.08;
+/// Share of a region's cells that must be so. It may be small, for a tip that just comes in, but not half the picture: some scenes are grey.
+const MIN_NEUTRAL_SHARE: f32 = 0.75;
 /// A region whose mean is darker is steel all the same (for a well exposed picture): pale organs are bright, means from 150 levels up.
 const DARK_LEVEL: f32 = 130.0;
+/// An instrument reaches the rim up to so many cells.
+const RIM_CELLS: usize = 6;
 /// Cells of up to this saturation are followed …
 const FOLLOWED_SATURATION: f32 = 0.33;
 /// … so far from a grey region, cells.
@@ -30,8 +37,8 @@ pub(super) struct Steel {
     grey: Image<f32>,
     distance: Image<u16>,
     components: Components,
-    /// Per region: sum of the levels and of their squares.
-    sums: Vec<[f32; 2]>,
+    /// Per region: sum of the levels, of their squares, and how many cells are neutral.
+    sums: Vec<[f32; 3]>,
     frontier: Vec<usize>,
     next: Vec<usize>,
     /// 255 on steel, one value a cell.
@@ -72,21 +79,30 @@ impl Steel {
         }
         self.components.label(&self.mask);
         self.sums.clear();
-        self.sums.resize(self.components.regions().len(), [0.0; 2]);
+        self.sums.resize(self.components.regions().len(), [0.0; 3]);
         for run in self.components.runs() {
-            let sums = &mut self.sums[run.label as usize];
-            for level in &cells.least.row(run.y as usize)[run.begin as usize..run.end as usize] {
-                *sums = [sums[0] + level, sums[1] + level * level];
+            let [sum, squares, neutral] = &mut self.sums[run.label as usize];
+            let first = run.y as usize * width;
+            for cell in first + run.begin as usize..first + run.end as usize {
+                let level = cells.least.pixels()[cell];
+                *sum += level;
+                *squares += level * level;
+                *neutral += if is_grey(cells, cell, NEUTRAL_SATURATION) { 1.0 } else { 0.0 };
             }
         }
-        let min_area = settings.steel_min_share * (width * height) as f32;
+        let cell_count = (width * height) as f32;
+        let min_area = settings.steel_min_share * cell_count;
         let sums = &self.sums;
         self.mask.fill(0);
         self.components.paint(&mut self.mask, 255, |label, region| {
             let area = region.area as f32;
             let mean = sums[label][0] / area;
             let variance = sums[label][1] / area - mean * mean;
-            area > min_area && (variance > (MIN_CONTRAST * mean).powi(2) || mean < DARK_LEVEL * brightness)
+            // Instruments come in from the rim; the lamp's image on tissue is as grey and uneven as steel.
+            let is_neutral = sums[label][2] > MIN_NEUTRAL_SHARE * area && area < 0.5 * cell_count;
+            let looks_so = is_neutral || (area > min_area && variance > (MIN_CONTRAST * mean).powi(2));
+            let comes_in = looks_so && is_at_rim(region, cells);
+            (comes_in && area > 0.5 * min_area) || (area > min_area && mean < DARK_LEVEL * brightness)
         });
         self.follow(cells);
         let limit = (radius + 2) as u16 * UNITS_PER_PX;
@@ -120,6 +136,22 @@ impl Steel {
             std::mem::swap(&mut self.frontier, &mut self.next);
         }
     }
+}
+
+/// True for a region that reaches the picture's border, or the image field's, up to a few cells.
+fn is_at_rim(region: &Region, cells: &Cells) -> bool {
+    let (width, height) = cells.size();
+    let Region {
+        left,
+        top,
+        right,
+        bottom,
+        ..
+    } = *region;
+    let columns = (left as usize).saturating_sub(RIM_CELLS)..(right as usize + RIM_CELLS).min(width);
+    let rows = (top as usize).saturating_sub(RIM_CELLS)..(bottom as usize + RIM_CELLS).min(height);
+    let at_border = columns.start == 0 || rows.start == 0 || columns.end == width || rows.end == height;
+    at_border || rows.into_iter().any(|y| cells.valid.row(y)[columns.clone()].contains(&0))
 }
 
 /// True for a cell with color to speak of, whose saturation is below this.

@@ -25,6 +25,7 @@ pub mod ensemble;
 #[cfg(test)]
 pub mod example;
 pub mod grid;
+pub mod lamp_light;
 pub mod live;
 pub mod lookup;
 mod replacement;

@@ -11,6 +11,7 @@ use crate::image::wide;
 use crate::stages::specularity_substitution::blend::{Canvas, PLAIN};
 use crate::stages::specularity_substitution::cut_patches::CutPatches;
 use crate::stages::specularity_substitution::grid::Grid;
+use crate::stages::specularity_substitution::lamp_light::LampLight;
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::settings::Settings;
 
@@ -48,6 +49,7 @@ pub struct Shares {
     own: Image<u8>,
     /// The most of a pixel and those around it.
     around: Image<u8>,
+    lamp_light: LampLight,
     cut_patches: CutPatches,
 }
 
@@ -56,6 +58,7 @@ impl Default for Shares {
         Self {
             own: Image::filled(0, 0, 0),
             around: Image::filled(0, 0, 0),
+            lamp_light: LampLight::default(),
             cut_patches: CutPatches::default(),
         }
     }
@@ -86,6 +89,7 @@ impl Shares {
                 }
             }
         });
+        self.lamp_light.leave_others(scene, canvas, &mut self.own, TISSUE + 1);
         self.cut_patches.leave(scene, canvas, &mut self.own, TISSUE + 1);
         self.look_around();
     }
@@ -141,6 +145,8 @@ pub struct Decision<'a> {
     pub blocks: &'a [u8],
     /// 255 where nothing may be touched.
     pub forbidden: &'a Mask,
+    /// The [`provenance_code`] of what is replaced.
+    pub filled: u8,
 }
 
 /// Replace, block by block.
@@ -316,7 +322,7 @@ impl wide::Kernel for Carry<'_, '_, '_> {
                     }
                     line[lane * step] = [new[0][lane], new[1][lane], new[2][lane]];
                     let (index, origin) = (first + lane * step, decision.origin(columns.start + lane, row));
-                    strip.code[index] = provenance_code::LIGHT_FIELD;
+                    strip.code[index] = decision.filled;
                     strip.view[index] = decision.canvas.source.pixels()[origin];
                     strip.confidence[index] = decision.canvas.belief.pixels()[origin];
                 }
@@ -476,6 +482,7 @@ mod tests {
             grid,
             blocks: &vec![1; grid.blocks().0 * grid.blocks().1],
             forbidden: &forbidden,
+            filled: provenance_code::LIGHT_FIELD,
         };
         let planes = Planes {
             image: &mut out.image,

@@ -6,12 +6,13 @@ use crossbeam::queue::ArrayQueue;
 use rayon::prelude::*;
 
 use crate::camera::model::CameraModel;
-use crate::frame::{Analysis, Frame, Provenance};
+use crate::frame::{Analysis, Frame, Provenance, provenance_code};
 use crate::image::buffer::{Image, Mask, Rgb8};
 use crate::image::distance::chamfer_distance;
 use crate::image::pool::Pool;
 use crate::image::specularity::REFERENCE_WIDTH_PX;
-use crate::light_field::view::LightField;
+use crate::light_field::view::{Kind, LightField};
+use crate::pipeline::slot::Slot;
 use crate::pipeline::stage::{Stage, StageError};
 use crate::stages::specularity_substitution::blend::Canvas;
 use crate::stages::specularity_substitution::camera_blending::CameraBlending;
@@ -47,12 +48,31 @@ impl Cameras {
     }
 }
 
+/// A light field, made ready to be asked.
+#[derive(Debug)]
+pub struct Witnesses {
+    light_field: Arc<LightField>,
+    small_views: Vec<SmallView>,
+}
+
+impl Witnesses {
+    /// The work of some views' pictures: not for a running line's thread.
+    pub fn new(light_field: Arc<LightField>) -> Self {
+        Self {
+            small_views: light_field.views.par_iter().map(SmallView::of).collect(),
+            light_field,
+        }
+    }
+}
+
 /// Replaces specularities by what other views saw; without a light field it only says what it left.
 #[derive(Debug)]
 pub struct SpecularitySubstitution {
     settings: Settings,
     light_field: Option<Arc<LightField>>,
     small_views: Vec<SmallView>,
+    /// Where a newer light field comes.
+    newer: Slot<Witnesses>,
     surface: SurfaceDepth,
     cameras: Option<Cameras>,
     distance: Image<u16>,
@@ -73,14 +93,20 @@ pub struct SpecularitySubstitution {
 impl SpecularitySubstitution {
     /// With a light field, or without one.
     pub fn new(settings: &Settings, light_field: Option<Arc<LightField>>) -> Self {
-        let small_views = light_field
-            .as_ref()
-            .map_or_else(Vec::new, |field| field.views.par_iter().map(SmallView::of).collect());
-        let fits = small_views.iter().map(|_| ViewFit::default()).collect();
+        let mut stage = Self::awaiting(settings, Slot::new());
+        if let Some(light_field) = light_field {
+            stage.adopt(Witnesses::new(light_field));
+        }
+        stage
+    }
+
+    /// Without a light field until one comes, and with every newer one from then on.
+    pub fn awaiting(settings: &Settings, newer: Slot<Witnesses>) -> Self {
         Self {
             settings: settings.clone(),
-            light_field,
-            small_views,
+            light_field: None,
+            small_views: Vec::new(),
+            newer,
             surface: SurfaceDepth::default(),
             cameras: None,
             distance: Image::filled(0, 0, 0),
@@ -88,7 +114,7 @@ impl SpecularitySubstitution {
             vantages: Vec::new(),
             blending: CameraBlending::default(),
             live: Live::default(),
-            fits,
+            fits: Vec::new(),
             benches: ArrayQueue::new(64),
             canvas: Canvas::default(),
             shares: Shares::default(),
@@ -96,6 +122,17 @@ impl SpecularitySubstitution {
             codes: Pool::new(64),
             views: Pool::new(32),
         }
+    }
+
+    fn adopt(&mut self, witnesses: Witnesses) {
+        let Witnesses {
+            light_field,
+            small_views,
+        } = witnesses;
+        self.fits = small_views.iter().map(|_| ViewFit::default()).collect();
+        self.light_field = Some(light_field);
+        self.small_views = small_views;
+        self.blending.forget();
     }
 
     /// Provenance of a picture, still to be filled.
@@ -211,6 +248,10 @@ impl SpecularitySubstitution {
             grid: scene.grid,
             blocks: &self.live.hole_blocks,
             forbidden: &self.forbidden,
+            filled: match light_field.kind {
+                Kind::Survey => provenance_code::LIGHT_FIELD,
+                Kind::Rolling => provenance_code::RECENT,
+            },
         };
         replace(&decision, planes);
         if let Some(alignment) = &mut frame.alignment {
@@ -262,6 +303,9 @@ impl Stage for SpecularitySubstitution {
         };
         if frame.scene_cut {
             self.reset();
+        }
+        if let Some(witnesses) = self.newer.take() {
+            self.adopt(witnesses);
         }
         let light_field = self.light_field.clone();
         let aligned = frame.alignment.is_some_and(|a| a.aligned) && frame.world_from_camera.is_some();
