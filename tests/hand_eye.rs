@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use endofield::calibration::hand_eye::refinement::{Settings, Sighting, refine};
+use endofield::calibration::hand_eye::refinement::{Settings, refine};
+use endofield::calibration::hand_eye::reprojection::Sighting;
 use endofield::calibration::pivot::{Outliers, pivot};
 use endofield::camera::distortion::Distortion;
 use endofield::camera::intrinsics::{Intrinsics, Pixel};

@@ -4,9 +4,11 @@ use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::calibration::hand_eye::consensus::agreement;
+use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::method::Method;
 use crate::calibration::hand_eye::motion::{Degenerate, Demands, Station, check};
-use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings, Sighting, refine};
+use crate::calibration::hand_eye::refinement::{Refined, Settings, refine};
+use crate::calibration::hand_eye::reprojection::Sighting;
 use crate::calibration::hand_eye::robot_world::board_of;
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Board, Camera, Hand, RobotBase};

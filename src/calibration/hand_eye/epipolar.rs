@@ -16,7 +16,8 @@ use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use crate::calibration::hand_eye::feature_tracks::FeatureTrack;
-use crate::calibration::hand_eye::refinement::{HandPoses, shifted};
+use crate::calibration::hand_eye::hand_poses::HandPoses;
+use crate::calibration::hand_eye::reprojection::shifted;
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, Hand, RobotBase};
 use crate::geometry::transform::Transform;

@@ -19,10 +19,13 @@ pub mod epipolar;
 #[cfg(test)]
 pub mod example;
 pub mod feature_tracks;
+pub mod hand_poses;
 pub mod method;
 pub mod motion;
 pub mod plot;
 pub mod refinement;
+pub mod reprojection;
 pub mod robot_world;
 pub mod rotation_first;
 pub mod simultaneous;
+mod spread;

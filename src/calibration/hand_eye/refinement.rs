@@ -9,48 +9,15 @@
 //! Pose errors and reprojection errors as objectives are compared by Tabb and Ahmad Yousef 2017 and by Ali et al. 2019; with the arm's
 //! errors as unknowns of their own the reprojection keeps the meaning that its covariance needs.
 
-use std::ops::Range;
+use nalgebra::{DMatrix, Matrix6, Vector6};
 
-use nalgebra::{DMatrix, Matrix6, UnitQuaternion, Vector3, Vector6};
-
-use crate::camera::intrinsics::Pixel;
+use crate::calibration::hand_eye::hand_poses::HandPoses;
+use crate::calibration::hand_eye::reprojection::{POSES, Reprojection, Sighting, State, told};
+use crate::calibration::hand_eye::spread::{LEAST_SIGMAS, Spread};
 use crate::camera::model::CameraModel;
-use crate::geometry::point::Point;
 use crate::geometry::space::{Board, Camera, Hand, RobotBase};
 use crate::geometry::transform::Transform;
-use crate::solver::least_squares::{self, Problem, Solution, minimize};
-use crate::solver::robust_loss::RobustLoss;
-
-/// A corner of the board, and where a view shows it.
-#[derive(Clone, Copy, Debug)]
-pub struct Sighting {
-    /// On the board, mm.
-    pub corner: Point<Board>,
-    /// In the picture, with the lens.
-    pub pixel: Pixel,
-}
-
-/// Where the hand was at each view.
-pub trait HandPoses: Sync {
-    /// The hand at a view, had the arm's stamps `offset_s` added and its joints `offsets` (mm or rad). `None` where the arm does not say.
-    fn base_from_hand(&self, view: usize, offset_s: f64, offsets: &[f64]) -> Option<Transform<RobotBase, Hand>>;
-
-    /// Joints whose offsets can be found; 0 for an arm that tells poses only.
-    fn joints(&self) -> usize {
-        0
-    }
-
-    /// The hand at a view, its joints taken as told.
-    fn as_told(&self, view: usize, offset_s: f64) -> Option<Transform<RobotBase, Hand>> {
-        self.base_from_hand(view, offset_s, &vec![0.0; self.joints()])
-    }
-}
-
-impl HandPoses for Vec<Transform<RobotBase, Hand>> {
-    fn base_from_hand(&self, view: usize, _: f64, _: &[f64]) -> Option<Transform<RobotBase, Hand>> {
-        self.get(view).copied()
-    }
-}
+use crate::solver::least_squares::{self, Problem as _, Solution, minimize};
 
 /// What is sought besides X and Z, and what is known of it.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,10 +60,6 @@ const MIDDLE: f64 = 2.366;
 const UNHEARD: f64 = 1e-6;
 /// The deviations found no longer move by more than this share.
 const SETTLED: f64 = 0.01;
-/// Deviations never fall below these, mm, rad, px: with exact data the corrections would have no room for rounding.
-const LEAST_SIGMAS: [f64; 3] = [1e-4, 1e-6, 1e-4];
-/// A corner's residual counts in full up to so many deviations.
-const HUBER: f64 = 2.5;
 
 /// The answer, with its errors.
 #[derive(Clone, Debug)]
@@ -176,106 +139,7 @@ pub fn refine(
     view_problem.answer(solution)
 }
 
-#[derive(Clone, Debug)]
-struct State {
-    /// Where the arm puts the hand at each view, at the time and joint offsets below.
-    told: Vec<Option<Transform<RobotBase, Hand>>>,
-    hand_from_camera: Transform<Hand, Camera>,
-    base_from_board: Transform<RobotBase, Board>,
-    time_offset_s: f64,
-    joints: Vec<f64>,
-    corrections: Vec<Vector6<f64>>,
-}
-
-fn told(hands: &dyn HandPoses, views: usize, offset_s: f64, offsets: &[f64]) -> Vec<Option<Transform<RobotBase, Hand>>> {
-    (0..views).map(|view| hands.base_from_hand(view, offset_s, offsets)).collect()
-}
-
-struct Reprojection<'a> {
-    views: &'a [Vec<Sighting>],
-    hands: &'a dyn HandPoses,
-    camera: &'a CameraModel,
-    /// First residual of each view, and one past the last.
-    first: &'a [usize],
-    joint_sigma: &'a [f64],
-    time_offset: bool,
-    spread: Spread,
-    pixel_sigma: f64,
-    /// Weight of each view's prior.
-    trust: Vec<f64>,
-    outlier: Vec<bool>,
-    distance: Vec<f64>,
-    /// Degrees of freedom of Student's t; none: normal.
-    tail: Option<f64>,
-}
-
-/// What is known of a time offset before, so that stations at rest do not leave it undetermined, s.
-const TIME_OFFSET_SIGMA_S: f64 = 0.2;
-/// How the corrections spread: a joint's error moves and turns the camera at once, so shift and turn go together.
-struct Spread {
-    covariance: Matrix6<f64>,
-    information: Matrix6<f64>,
-    /// Turns a correction into standard deviations: the inverse of the covariance's lower root.
-    whitening: Matrix6<f64>,
-}
-
-/// A spread is held to be isotropic with the weight of so many views: few views do not tell how shift and turn go together.
-const ISOTROPIC_VIEWS: f64 = 8.0;
-
-impl Spread {
-    fn isotropic(place_mm: f64, turn_rad: f64) -> Option<Self> {
-        let [place, turn] = [place_mm.max(LEAST_SIGMAS[0]), turn_rad.max(LEAST_SIGMAS[1])].map(|sigma| sigma * sigma);
-        Self::of(Matrix6::from_diagonal(&Vector6::new(place, place, place, turn, turn, turn)))
-    }
-
-    /// From the sum over views of a correction's square.
-    fn learnt(sum: Matrix6<f64>, views: usize) -> Option<Self> {
-        let count = views as f64;
-        let variance = |first: usize| sum.fixed_view::<3, 3>(first, first).trace() / (3.0 * count);
-        let isotropic = Self::isotropic(variance(0).sqrt(), variance(3).sqrt())?;
-        Self::of((sum + ISOTROPIC_VIEWS * isotropic.covariance) / (count + ISOTROPIC_VIEWS))
-    }
-
-    fn of(covariance: Matrix6<f64>) -> Option<Self> {
-        let lower = covariance.cholesky()?.l();
-        let whitening = lower.try_inverse()?;
-        Some(Self {
-            covariance,
-            information: whitening.transpose() * whitening,
-            whitening,
-        })
-    }
-}
-
-/// Directions of X and Z.
-const POSES: usize = 12;
-
 impl Reprojection<'_> {
-    /// Directions before the corrections: X, Z, time, joints.
-    fn common(&self) -> usize {
-        POSES + usize::from(self.time_offset) + self.joint_sigma.len()
-    }
-
-    /// Where the camera was at a view.
-    fn eye(&self, state: &State, view: usize) -> Option<Transform<RobotBase, Camera>> {
-        let told = state.told.get(view).copied()??;
-        let correction: Transform<Camera, Camera> = shifted(&Transform::identity(), state.corrections[view].as_slice());
-        Some(told * state.hand_from_camera * correction)
-    }
-
-    /// Where a view shows a corner from a camera's pose, minus where it was seen, px.
-    fn residual(&self, state: &State, base_from_camera: &Transform<RobotBase, Camera>, sighting: &Sighting) -> Option<[f64; 2]> {
-        let camera_from_board = base_from_camera.inverse() * state.base_from_board;
-        let pixel = self.camera.project(camera_from_board * sighting.corner)?;
-        Some([pixel.x - sighting.pixel.x, pixel.y - sighting.pixel.y])
-    }
-
-    /// Place mm, turn rad, corner px.
-    fn sigmas(&self) -> [f64; 3] {
-        let variance = |first: usize| self.spread.covariance.fixed_view::<3, 3>(first, first).trace() / 3.0;
-        [variance(0).sqrt(), variance(3).sqrt(), self.pixel_sigma]
-    }
-
     /// The answer whose corrections spread as the prior says.
     fn settled(
         &mut self,
@@ -397,129 +261,11 @@ impl Reprojection<'_> {
             predicted_px: (0..self.views.len()).map(|view| self.rms_of(&without, view)).collect(),
         })
     }
-
-    /// Root mean square of a view's residual vectors, px.
-    fn rms_of(&self, state: &State, view: usize) -> f64 {
-        let Some(eye) = self.eye(state, view) else {
-            return f64::NAN;
-        };
-        let squares = (self.views[view].iter())
-            .map(|sighting| (self.residual(state, &eye, sighting)).map_or(f64::NAN, |[x, y]| x * x + y * y));
-        (squares.sum::<f64>() / self.views[view].len() as f64).sqrt()
-    }
-}
-
-impl Problem for Reprojection<'_> {
-    type State = State;
-
-    fn directions(&self) -> usize {
-        self.common() + 6 * self.views.len()
-    }
-
-    fn measured(&self) -> usize {
-        self.first[self.views.len()]
-    }
-
-    fn priors(&self) -> usize {
-        6 * self.views.len() + self.joint_sigma.len() + usize::from(self.time_offset)
-    }
-
-    fn loss(&self) -> RobustLoss {
-        RobustLoss::Huber { width: HUBER }
-    }
-
-    fn residuals(&self, state: &State, rows: Range<usize>, out: &mut [f64]) {
-        let measured = self.measured();
-        let mut row = rows.start;
-        while row < rows.end.min(measured) {
-            let view = self.first.partition_point(|&first| first <= row) - 1;
-            let eye = self.eye(state, view);
-            let end = self.first[view + 1].min(rows.end);
-            while row < end {
-                let sighting = &self.views[view][(row - self.first[view]) / 2];
-                let residual = eye
-                    .and_then(|eye| self.residual(state, &eye, sighting))
-                    .unwrap_or([f64::NAN; 2]);
-                // Blocks are asked for whole.
-                out[row - rows.start] = residual[0] / self.pixel_sigma;
-                out[row + 1 - rows.start] = residual[1] / self.pixel_sigma;
-                row += 2;
-            }
-        }
-        for row in row..rows.end {
-            let prior = row - measured;
-            out[row - rows.start] = match prior.checked_sub(6 * self.views.len()) {
-                Some(joint) if joint < self.joint_sigma.len() => state.joints[joint] / self.joint_sigma[joint],
-                Some(_) => state.time_offset_s / TIME_OFFSET_SIGMA_S,
-                None => {
-                    let (view, axis) = (prior / 6, prior % 6);
-                    let whitened = self.spread.whitening.row(axis).transpose().dot(&state.corrections[view]);
-                    self.trust[view].sqrt() * whitened
-                }
-            };
-        }
-    }
-
-    fn moved(&self, state: &State, step: &[f64]) -> State {
-        let common = self.common();
-        let first_joint = POSES + usize::from(self.time_offset);
-        let time_offset_s = state.time_offset_s + if self.time_offset { step[POSES] } else { 0.0 };
-        let joints: Vec<f64> = (state.joints.iter().zip(&step[first_joint..]))
-            .map(|(joint, step)| joint + step)
-            .collect();
-        // Asking the arm costs more than all the rest.
-        let told = if step[POSES..common].iter().all(|step| *step == 0.0) {
-            state.told.clone()
-        } else {
-            told(self.hands, self.views.len(), time_offset_s, &joints)
-        };
-        State {
-            told,
-            hand_from_camera: shifted(&state.hand_from_camera, &step[..6]),
-            base_from_board: shifted(&state.base_from_board, &step[6..POSES]),
-            time_offset_s,
-            joints,
-            corrections: (state.corrections.iter().zip(step[common..].chunks(6)))
-                .map(|(correction, step)| correction + Vector6::from_column_slice(step))
-                .collect(),
-        }
-    }
-
-    fn support(&self, direction: usize) -> Vec<Range<usize>> {
-        let (measured, common) = (self.measured(), self.common());
-        let own = |prior: usize| measured + prior..measured + prior + 1;
-        match direction.checked_sub(common) {
-            Some(correction) => {
-                let view = correction / 6;
-                let first = measured + 6 * view;
-                vec![self.first[view]..self.first[view + 1], first..first + 6]
-            }
-            None => match direction.checked_sub(POSES + usize::from(self.time_offset)) {
-                Some(joint) => vec![0..measured, own(6 * self.views.len() + joint)],
-                None if direction == POSES && self.time_offset => {
-                    vec![0..measured, own(6 * self.views.len() + self.joint_sigma.len())]
-                }
-                None => vec![0..measured],
-            },
-        }
-    }
-
-    fn small_step(&self, direction: usize) -> f64 {
-        // Samples of the arm lie milliseconds apart.
-        if self.time_offset && direction == POSES { 1e-4 } else { 1e-5 }
-    }
-}
-
-/// A pose whose origin is moved by the first three numbers (mm), and that is turned about it by the rotation vector of the others (rad),
-/// both in the space it leads to.
-pub(crate) fn shifted<To, From>(pose: &Transform<To, From>, by: &[f64]) -> Transform<To, From> {
-    let turn = UnitQuaternion::from_scaled_axis(Vector3::new(by[3], by[4], by[5]));
-    Transform::new(turn * pose.rotation(), pose.translation() + Vector3::new(by[0], by[1], by[2]))
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::DVector;
+    use nalgebra::{DVector, UnitQuaternion, Vector3};
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::StandardNormal;
@@ -528,7 +274,10 @@ mod tests {
     use crate::calibration::hand_eye::example::{Example, Noise, camera};
     use crate::calibration::hand_eye::method::Method;
     use crate::calibration::hand_eye::motion::Station;
+    use crate::calibration::hand_eye::reprojection::shifted;
     use crate::calibration::hand_eye::robot_world::board_of;
+    use crate::camera::intrinsics::Pixel;
+    use crate::geometry::point::Point;
     use crate::robot::kinematics::{Arm, JointKind};
 
     const PIXEL_SIGMA: f64 = 0.1;

@@ -6,8 +6,9 @@ use nalgebra::Matrix6;
 use serde::Serialize;
 
 use crate::calibration::hand_eye::calibrate::{Held, StationView, leave_out, stations};
+use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::method::METHODS;
-use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings};
+use crate::calibration::hand_eye::refinement::{Refined, Settings};
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, Hand};
 use crate::geometry::transform::Transform;
