@@ -16,6 +16,7 @@ pub mod calibrate;
 pub mod consensus;
 pub mod dual_quaternion;
 pub mod epipolar;
+pub mod epipolar_search;
 #[cfg(test)]
 pub mod example;
 pub mod feature_tracks;
@@ -29,3 +30,4 @@ pub mod robot_world;
 pub mod rotation_first;
 pub mod simultaneous;
 mod spread;
+pub mod view_pairs;

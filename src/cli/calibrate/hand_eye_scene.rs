@@ -6,11 +6,13 @@ use anyhow::Context as _;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use crate::calibration::hand_eye::epipolar::{FromScene, Settings, ViewPair, essential, pairs, refine, search};
+use crate::calibration::hand_eye::epipolar::{FromScene, Settings, refine};
+use crate::calibration::hand_eye::epipolar_search::search;
 use crate::calibration::hand_eye::feature_tracks::{FeatureTrack, FeatureTracker};
 use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::motion::{Demands, Station, check};
 use crate::calibration::hand_eye::plot::{self, Drawn};
+use crate::calibration::hand_eye::view_pairs::{ViewPair, essential, pairs};
 use crate::camera::model::CameraModel;
 use crate::cli::calibrate::hand_eye::{Args, camera_of};
 use crate::cli::calibrate::hand_eye_report::Placement;
