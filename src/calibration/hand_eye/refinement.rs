@@ -11,6 +11,7 @@
 
 use nalgebra::{DMatrix, Matrix6, Vector6};
 
+use crate::calibration::hand_eye::camera_prior::CameraPrior;
 use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::reprojection::{POSES, Reprojection, Sighting, State, told};
 use crate::calibration::hand_eye::spread::{LEAST_SIGMAS, Spread};
@@ -26,6 +27,8 @@ pub struct Settings {
     pub time_offset: bool,
     /// Prior deviation of each joint's offset (mm or rad); none: joints are right.
     pub joint_sigma: Vec<f64>,
+    /// How far the camera's numbers may be off; none: it is right.
+    pub camera_prior: Option<CameraPrior>,
     /// First guess of how far the camera is from where the arm puts it, along an axis, mm.
     pub place_sigma_mm: f64,
     /// The same of its rotation about an axis, rad.
@@ -41,6 +44,7 @@ impl Default for Settings {
         Self {
             time_offset: false,
             joint_sigma: Vec::new(),
+            camera_prior: None,
             place_sigma_mm: 0.5,
             turn_sigma_rad: 0.003,
             pixel_sigma: 0.3,
@@ -76,6 +80,10 @@ pub struct Refined {
     pub time_offset_s: [f64; 2],
     /// Per joint: offset to be added to its reading, and its deviation, mm or rad.
     pub joint_offsets: Vec<[f64; 2]>,
+    /// As given, or as adjusted.
+    pub camera: CameraModel,
+    /// Of its numbers, if they were adjusted, in the order of their prior.
+    pub camera_covariance: Option<DMatrix<f64>>,
     /// Per view, what the arm told wrongly of the camera: shift (mm) and rotation vector (rad) in the camera's space.
     pub corrections: Vec<Vector6<f64>>,
     /// Per view, whether its hand was elsewhere than the arm said: such a view is not heard.
@@ -110,12 +118,14 @@ pub fn refine(
         base_from_board,
         time_offset_s: 0.0,
         joints: vec![0.0; joints],
+        camera: (settings.camera_prior.as_ref()).map_or_else(|| camera.clone(), |prior| prior.begun(camera)),
         corrections: vec![Vector6::zeros(); views.len()],
     };
     let mut view_problem = Reprojection {
         views,
         hands,
         camera,
+        camera_prior: settings.camera_prior.as_ref(),
         first: &first,
         joint_sigma: &settings.joint_sigma[..joints],
         time_offset: settings.time_offset,
@@ -216,6 +226,9 @@ impl Reprojection<'_> {
             views += 1;
         }
         self.spread = Spread::learnt(sum, views)?;
+        if let Some(prior) = self.camera_prior {
+            held += prior.held(&self.camera_doubt(solution)?);
+        }
         // A corner within Huber's width counts in full; the residuals of Gaussian noise lose as many squares as there are unknowns, and
         // of the corrections only as many are the picture's as the prior does not hold.
         let rest: f64 = (solution.residuals.rows(0, self.measured()).iter().enumerate())
@@ -226,6 +239,12 @@ impl Reprojection<'_> {
         let free = (heard - unknowns).max(1.0);
         self.pixel_sigma = (self.pixel_sigma * (rest / free).sqrt()).max(LEAST_SIGMAS[2]);
         Some(())
+    }
+
+    /// Covariance of the camera's numbers.
+    fn camera_doubt(&self, solution: &Solution<State>) -> Option<DMatrix<f64>> {
+        let (at, count) = (self.first_lens(), self.lens());
+        Some(solution.covariance.as_ref()?.view((at, at), (count, count)).into_owned())
     }
 
     fn answer(&self, solution: Solution<State>) -> Option<Refined> {
@@ -253,6 +272,8 @@ impl Reprojection<'_> {
                 [0.0; 2]
             },
             joint_offsets: joint_offsets.collect(),
+            camera: state.camera.clone(),
+            camera_covariance: self.camera_prior.and_then(|_| self.camera_doubt(&solution)),
             corrections: state.corrections.clone(),
             outlier: self.outlier.clone(),
             distance: self.distance.clone(),
@@ -265,98 +286,19 @@ impl Reprojection<'_> {
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{DVector, UnitQuaternion, Vector3};
+    use nalgebra::{UnitQuaternion, Vector3};
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::StandardNormal;
 
     use super::*;
-    use crate::calibration::hand_eye::example::{Example, Noise, camera};
-    use crate::calibration::hand_eye::method::Method;
-    use crate::calibration::hand_eye::motion::Station;
+    use crate::calibration::hand_eye::example::{PIXEL_SIGMA, Recorded, camera};
     use crate::calibration::hand_eye::reprojection::shifted;
-    use crate::calibration::hand_eye::robot_world::board_of;
-    use crate::camera::intrinsics::Pixel;
-    use crate::geometry::point::Point;
-    use crate::robot::kinematics::{Arm, JointKind};
-
-    const PIXEL_SIGMA: f64 = 0.1;
-
-    struct Recorded {
-        example: Example,
-        views: Vec<Vec<Sighting>>,
-        hands: Vec<Transform<RobotBase, Hand>>,
-    }
-
-    /// Corners of a small board with noise, and hands whose joints were off by so much (0.1 mm in the slide), seen through the arm's
-    /// Jacobian at random postures.
-    fn recorded(seed: u64, count: usize, joint_rad: f64) -> Recorded {
-        let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5EED);
-        let example = Example::new(seed, count, Noise::NONE);
-        let arm = Arm::aesop_3000().unwrap();
-        let mut views = Vec::new();
-        let mut hands = Vec::new();
-        for station in &example.stations {
-            let corners = (0..20).map(|i| Point::new(f64::from(i % 5) * 8.0, f64::from(i / 5) * 8.0, 0.0));
-            let sightings = corners.map(|corner| {
-                let pixel = camera().project(station.camera_from_board * corner).unwrap();
-                let mut noise = || PIXEL_SIGMA * random.sample::<f64, _>(StandardNormal);
-                let pixel = Pixel {
-                    x: pixel.x + noise(),
-                    y: pixel.y + noise(),
-                };
-                Sighting { corner, pixel }
-            });
-            views.push(sightings.collect());
-            let posture: Vec<f64> = (arm.joints().iter())
-                .map(|joint| joint.limits[0] + random.random::<f64>() * (joint.limits[1] - joint.limits[0]))
-                .collect();
-            let off = DVector::from_iterator(
-                posture.len(),
-                arm.joints().iter().map(|joint| {
-                    let sigma = if joint.kind == JointKind::Prismatic && joint_rad > 0.0 {
-                        0.1
-                    } else {
-                        joint_rad
-                    };
-                    sigma * random.sample::<f64, _>(StandardNormal)
-                }),
-            );
-            let twist = arm.jacobian(&posture).unwrap() * off;
-            hands.push(shifted(&station.base_from_hand, twist.as_slice()));
-        }
-        Recorded { example, views, hands }
-    }
-
-    impl Recorded {
-        fn start(&self) -> (Transform<Hand, Camera>, Transform<RobotBase, Board>) {
-            let stations: Vec<Station> = (self.example.stations.iter().zip(&self.hands))
-                .map(|(station, &base_from_hand)| Station {
-                    base_from_hand,
-                    ..*station
-                })
-                .collect();
-            let hand_from_camera = Method::Park.solve(&stations).unwrap();
-            (hand_from_camera, board_of(&stations, &hand_from_camera).unwrap())
-        }
-
-        fn refined(&self, settings: &Settings) -> Refined {
-            refine(&self.views, &self.hands, &camera(), self.start(), settings).unwrap()
-        }
-
-        /// The truth minus the answer, in the directions of the covariance.
-        fn error(&self, refined: &Refined) -> Vector6<f64> {
-            let (truth, found) = (self.example.hand_from_camera, refined.hand_from_camera);
-            let turn = (truth.rotation() * found.rotation().inverse()).scaled_axis();
-            let shift = truth.translation() - found.translation();
-            Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
-        }
-    }
 
     #[test]
     fn with_an_exact_arm_only_the_corners_noise_is_left() {
         for seed in 0..5 {
-            let recorded = recorded(seed, 20, 0.0);
+            let recorded = Recorded::new(seed, 20, 0.0);
             let refined = recorded.refined(&Settings::default());
             let [mm, rad] = recorded.example.error_of(&refined.hand_from_camera);
             assert!(mm < 0.05 && rad.to_degrees() < 0.02, "{seed}: {mm} mm, {}°", rad.to_degrees());
@@ -388,7 +330,7 @@ mod tests {
     fn covered(runs: u64) {
         let (mut inside, mut square) = (0, 0.0);
         for seed in 0..runs {
-            let recorded = recorded(100 + seed, 20, 0.05_f64.to_radians());
+            let recorded = Recorded::new(100 + seed, 20, 0.05_f64.to_radians());
             let refined = recorded.refined(&Settings::default());
             let [mm, rad] = recorded.example.error_of(&refined.hand_from_camera);
             assert!(mm < 1.0 && rad.to_degrees() < 0.2, "{seed}: {mm} mm, {}°", rad.to_degrees());
@@ -404,7 +346,7 @@ mod tests {
 
     #[test]
     fn a_view_whose_hand_was_elsewhere_is_found_and_let_go() {
-        let mut recorded = recorded(7, 12, 0.02_f64.to_radians());
+        let mut recorded = Recorded::new(7, 12, 0.02_f64.to_radians());
         let right = recorded.refined(&Settings::default());
         recorded.hands[4] = shifted(&recorded.hands[4], &[4.0, -3.0, 2.0, 0.02, 0.0, -0.015]);
         let refined = recorded.refined(&Settings::default());
@@ -450,7 +392,7 @@ mod tests {
                 2
             }
         }
-        let recorded = recorded(9, 24, 0.0);
+        let recorded = Recorded::new(9, 24, 0.0);
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let moving = Moving {
             told: recorded.hands.clone(),

@@ -4,6 +4,8 @@ use std::ops::Range;
 
 use nalgebra::{UnitQuaternion, Vector3, Vector6};
 
+use crate::calibration::camera::lens;
+use crate::calibration::hand_eye::camera_prior::CameraPrior;
 use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::spread::Spread;
 use crate::camera::intrinsics::Pixel;
@@ -38,6 +40,7 @@ pub(super) struct State {
     pub(super) base_from_board: Transform<RobotBase, Board>,
     pub(super) time_offset_s: f64,
     pub(super) joints: Vec<f64>,
+    pub(super) camera: CameraModel,
     pub(super) corrections: Vec<Vector6<f64>>,
 }
 
@@ -53,7 +56,10 @@ pub(super) fn told(
 pub(super) struct Reprojection<'a> {
     pub(super) views: &'a [Vec<Sighting>],
     pub(super) hands: &'a dyn HandPoses,
+    /// As given.
     pub(super) camera: &'a CameraModel,
+    /// None: it stays as given.
+    pub(super) camera_prior: Option<&'a CameraPrior>,
     /// First residual of each view, and one past the last.
     pub(super) first: &'a [usize],
     pub(super) joint_sigma: &'a [f64],
@@ -69,9 +75,24 @@ pub(super) struct Reprojection<'a> {
 }
 
 impl Reprojection<'_> {
-    /// Directions before the corrections: X, Z, time, joints.
-    pub(super) fn common(&self) -> usize {
+    /// Numbers of the camera that are adjusted.
+    pub(super) fn lens(&self) -> usize {
+        self.camera_prior.map_or(0, CameraPrior::count)
+    }
+
+    /// Directions before the camera's: X, Z, time, joints.
+    pub(super) fn first_lens(&self) -> usize {
         POSES + usize::from(self.time_offset) + self.joint_sigma.len()
+    }
+
+    /// Directions before the corrections: X, Z, time, joints, camera.
+    pub(super) fn common(&self) -> usize {
+        self.first_lens() + self.lens()
+    }
+
+    /// First row of the camera's prior.
+    fn first_lens_prior(&self) -> usize {
+        self.measured() + 6 * self.views.len() + self.joint_sigma.len() + usize::from(self.time_offset)
     }
 
     /// Where the camera was at a view.
@@ -89,7 +110,7 @@ impl Reprojection<'_> {
         sighting: &Sighting,
     ) -> Option<[f64; 2]> {
         let camera_from_board = base_from_camera.inverse() * state.base_from_board;
-        let pixel = self.camera.project(camera_from_board * sighting.corner)?;
+        let pixel = state.camera.project(camera_from_board * sighting.corner)?;
         Some([pixel.x - sighting.pixel.x, pixel.y - sighting.pixel.y])
     }
 
@@ -122,7 +143,7 @@ impl Problem for Reprojection<'_> {
     }
 
     fn priors(&self) -> usize {
-        6 * self.views.len() + self.joint_sigma.len() + usize::from(self.time_offset)
+        6 * self.views.len() + self.joint_sigma.len() + usize::from(self.time_offset) + self.lens()
     }
 
     fn loss(&self) -> RobustLoss {
@@ -147,7 +168,14 @@ impl Problem for Reprojection<'_> {
                 row += 2;
             }
         }
-        for row in row..rows.end {
+        let first_lens_prior = self.first_lens_prior();
+        if let Some(prior) = self.camera_prior.filter(|_| rows.end > first_lens_prior) {
+            let difference = prior.difference(&state.camera, self.camera);
+            for row in row.max(first_lens_prior)..rows.end {
+                out[row - rows.start] = prior.residual(row - first_lens_prior, &difference);
+            }
+        }
+        for row in row..rows.end.min(first_lens_prior) {
             let prior = row - measured;
             out[row - rows.start] = match prior.checked_sub(6 * self.views.len()) {
                 Some(joint) if joint < self.joint_sigma.len() => state.joints[joint] / self.joint_sigma[joint],
@@ -162,14 +190,20 @@ impl Problem for Reprojection<'_> {
     }
 
     fn moved(&self, state: &State, step: &[f64]) -> State {
-        let common = self.common();
+        let (common, first_lens) = (self.common(), self.first_lens());
         let first_joint = POSES + usize::from(self.time_offset);
         let time_offset_s = state.time_offset_s + if self.time_offset { step[POSES] } else { 0.0 };
         let joints: Vec<f64> = (state.joints.iter().zip(&step[first_joint..]))
             .map(|(joint, step)| joint + step)
             .collect();
+        let mut camera = state.camera.clone();
+        if let Some(prior) = self.camera_prior {
+            for (place, step) in step[first_lens..common].iter().enumerate() {
+                lens::add(&mut camera, prior.model(), place, *step);
+            }
+        }
         // Asking the arm costs more than all the rest.
-        let told = if step[POSES..common].iter().all(|step| *step == 0.0) {
+        let told = if step[POSES..first_lens].iter().all(|step| *step == 0.0) {
             state.told.clone()
         } else {
             told(self.hands, self.views.len(), time_offset_s, &joints)
@@ -180,6 +214,7 @@ impl Problem for Reprojection<'_> {
             base_from_board: shifted(&state.base_from_board, &step[6..POSES]),
             time_offset_s,
             joints,
+            camera,
             corrections: (state.corrections.iter().zip(step[common..].chunks(6)))
                 .map(|(correction, step)| correction + Vector6::from_column_slice(step))
                 .collect(),
@@ -195,6 +230,10 @@ impl Problem for Reprojection<'_> {
                 let first = measured + 6 * view;
                 vec![self.first[view]..self.first[view + 1], first..first + 6]
             }
+            None if direction >= self.first_lens() => {
+                let first = self.first_lens_prior();
+                vec![0..measured, first..first + self.lens()]
+            }
             None => match direction.checked_sub(POSES + usize::from(self.time_offset)) {
                 Some(joint) => vec![0..measured, own(6 * self.views.len() + joint)],
                 None if direction == POSES && self.time_offset => {
@@ -206,6 +245,12 @@ impl Problem for Reprojection<'_> {
     }
 
     fn small_step(&self, direction: usize) -> f64 {
+        if let Some(prior) = self.camera_prior
+            && let Some(place) = direction.checked_sub(self.first_lens())
+            && place < prior.count()
+        {
+            return prior.small_step(place, self.camera);
+        }
         // Samples of the arm lie milliseconds apart.
         if self.time_offset && direction == POSES { 1e-4 } else { 1e-5 }
     }
