@@ -70,6 +70,14 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         .recording
         .as_deref()
         .ok_or_else(|| UsageError("expected a recording to calibrate from, or --board with --square-mm and --images".into()))?;
+    if args.refine_camera {
+        return Err(UsageError(
+            "--refine-camera needs a board: tracks of a scene do not tell the camera from the arm's errors; add --board and --square-mm, or \
+             leave it out"
+                .into(),
+        )
+        .into());
+    }
     let [report_path, plot_path] = ["_report.json", "_report.png"].map(|ending| super::beside(&args.output, ending));
     for path in [&args.output, &report_path, &plot_path] {
         context.refuse_overwriting(path)?;
