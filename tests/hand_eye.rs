@@ -2,9 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use endofield::calibration::hand_eye::refinement::{Settings, Sighting, refine};
+use endofield::calibration::hand_eye::refinement::{Settings, refine};
+use endofield::calibration::hand_eye::reprojection::Sighting;
 use endofield::calibration::pivot::{Outliers, pivot};
 use endofield::camera::distortion::Distortion;
+use endofield::camera::file;
 use endofield::camera::intrinsics::{Intrinsics, Pixel};
 use endofield::camera::model::CameraModel;
 use endofield::geometry::point::Point;
@@ -154,10 +156,8 @@ fn a_real_pointer_has_its_tip_where_others_found_it() {
     );
 }
 
-#[test]
-fn the_command_finds_hand_and_clock_of_a_simulated_arm() {
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("sim");
+/// An arm that carries its camera over a board.
+fn simulated(folder: &Path) -> PathBuf {
     let sim = endofield(
         &[
             "simulate",
@@ -173,9 +173,16 @@ fn the_command_finds_hand_and_clock_of_a_simulated_arm() {
             "--seed",
             "5",
         ],
-        folder.path(),
+        folder,
     );
     assert!(sim.status.success(), "{}", told(&sim));
+    folder.join("sim")
+}
+
+#[test]
+fn the_command_finds_hand_and_clock_of_a_simulated_arm() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = simulated(folder.path());
     let result = folder.path().join("hand_eye.yaml");
     let live = out.join("live");
     let camera = out.join("truth/live/camera.yaml");
@@ -211,6 +218,93 @@ fn the_command_finds_hand_and_clock_of_a_simulated_arm() {
     assert!((13..=14).contains(&report["views"].as_array().unwrap().len()));
     let plot = endofield::media::image_files::read(&folder.path().join("hand_eye_report.png")).unwrap();
     assert!(plot.width() > 800);
+}
+
+#[test]
+fn the_command_puts_a_camera_right_that_is_a_little_wrong() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = simulated(folder.path());
+    let truth = file::read(&out.join("truth/live/camera.yaml")).unwrap();
+    let mut given = truth.clone();
+    given.intrinsics.fx *= 1.007;
+    given.intrinsics.fy *= 1.007;
+    given.intrinsics.cx += 2.5;
+    file::write(&folder.path().join("scope.yaml"), &given, "scope").unwrap();
+    let arguments = [
+        "calibrate",
+        "hand-eye",
+        "sim/live",
+        "--camera",
+        "scope.yaml",
+        "--frames",
+        "14",
+        "-o",
+        "found.yaml",
+        "--refine-camera",
+    ];
+    let without_board = endofield(&arguments, folder.path());
+    assert!(
+        without_board.status.code() == Some(2) && told(&without_board).contains("--refine-camera needs a board"),
+        "{}",
+        told(&without_board)
+    );
+    let with_board = [&arguments[..], &["--board", "checkerboard:9x6", "--square-mm", "4"]].concat();
+    let ran = endofield(&with_board, folder.path());
+    assert!(ran.status.success(), "{}", told(&ran));
+    let report = std::fs::read_to_string(folder.path().join("found_report.json")).unwrap();
+    let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+    let refined = file::read(&folder.path().join("found_camera.yaml")).unwrap();
+    let intrinsics = |camera: &CameraModel| {
+        let Intrinsics { fx, fy, cx, cy } = camera.intrinsics;
+        [fx, fy, cx, cy]
+    };
+    let numbers = intrinsics(&truth)
+        .into_iter()
+        .zip(intrinsics(&refined))
+        .zip(intrinsics(&given));
+    for (place, ((right, found), given)) in numbers.enumerate() {
+        let told = &report["camera"]["parameters"][place];
+        let number = |key: &str| told[key].as_f64().unwrap();
+        assert!(
+            (number("value") - found).abs() < 1e-9 && (number("given") - given).abs() < 1e-9,
+            "{told}"
+        );
+        assert!(
+            (found - right).abs() < 4.0 * number("sigma") && number("sigma") < number("given_sigma"),
+            "{right}: {told}"
+        );
+    }
+    // What was wrong by 0.7 % and 2.5 px.
+    let off = |place: usize| (intrinsics(&refined)[place] / intrinsics(&truth)[place] - 1.0).abs();
+    assert!(off(0) < 0.0035 && off(1) < 0.0035, "{refined:?}\n{}", told(&ran));
+    assert_eq!(report["methods"][1]["method"], "camera as given");
+    assert!(report["warnings"].as_array().unwrap().is_empty(), "{}", told(&ran));
+    // X is nearer to the truth than with the camera as given, by which it is some 1 mm and 0.3° off.
+    let plain: Vec<&str> = with_board
+        .iter()
+        .filter(|word| **word != "--refine-camera")
+        .map(|word| if *word == "found.yaml" { "plain.yaml" } else { word })
+        .collect();
+    let without = endofield(&plain, folder.path());
+    assert!(without.status.success(), "{}", told(&without));
+    let hand_eye = |path: &Path| HandEye::read(path).unwrap().hand_from_camera;
+    let right = hand_eye(&out.join("truth/live/hand_eye.yaml"));
+    let [mm, deg] = apart(&hand_eye(&folder.path().join("found.yaml")), &right);
+    let [plain_mm, plain_deg] = apart(&hand_eye(&folder.path().join("plain.yaml")), &right);
+    assert!(
+        mm < 0.8 * plain_mm && deg < 0.8 * plain_deg,
+        "{mm} mm {deg}°, {plain_mm} mm {plain_deg}°"
+    );
+    // No file is overwritten, the camera's neither.
+    std::fs::remove_file(folder.path().join("found.yaml")).unwrap();
+    std::fs::remove_file(folder.path().join("found_report.json")).unwrap();
+    std::fs::remove_file(folder.path().join("found_report.png")).unwrap();
+    let again = endofield(&with_board, folder.path());
+    assert!(
+        !again.status.success() && told(&again).contains("found_camera.yaml"),
+        "{}",
+        told(&again)
+    );
 }
 
 #[test]

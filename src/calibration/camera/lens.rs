@@ -38,6 +38,18 @@ impl LensModel {
         }
     }
 
+    /// The simplest of which a camera's lens is one; of a camera without a lens, [`LensModel::PlumbBob`].
+    pub fn of(camera: &CameraModel) -> Self {
+        match camera.distortion {
+            Distortion::KannalaBrandt { .. } => Self::Equidistant,
+            Distortion::BrownConrady {
+                k: [_, _, _, k4, k5, k6],
+                ..
+            } if [k4, k5, k6] != [0.0; 3] => Self::RationalPolynomial,
+            Distortion::BrownConrady { .. } | Distortion::None => Self::PlumbBob,
+        }
+    }
+
     /// The camera with a pinhole of `intrinsics` and no distortion of this model.
     pub fn camera(self, width: usize, height: usize, intrinsics: Intrinsics) -> CameraModel {
         let distortion = match self {
@@ -143,6 +155,7 @@ mod tests {
             for place in 4..model.names().len() {
                 assert_eq!(parameter(&camera, model, place), 0.125 + place as f64);
             }
+            assert_eq!(LensModel::of(&camera), model);
             assert_eq!(parameter(&camera, model, 1), 502.125);
         }
     }

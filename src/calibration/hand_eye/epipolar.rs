@@ -5,167 +5,25 @@
 //! (Sampson 1982; Hartley and Zisserman 2004, eq. 11.9) least, with the metre given by the arm (compare Andreff, Horaud and Espiau 2001,
 //! who go by way of a structure from motion and its unknown scale). No point of the scene has to be reconstructed.
 //!
-//! The first X is searched: for a rotation, the constraint is linear in X's shift; rotations are tried all over, the best are refined.
+//! The first X is searched ([`epipolar_search`](super::epipolar_search)), the best answers are refined.
 
 use std::ops::Range;
 
-use nalgebra::{DMatrix, Matrix3, Matrix6, UnitQuaternion, Vector3, Vector6};
-use rand::{RngExt as _, SeedableRng as _};
-use rand_chacha::ChaCha8Rng;
-use rand_distr::StandardNormal;
+use nalgebra::{DMatrix, Matrix6, Vector6};
 use rayon::prelude::*;
 
-use crate::calibration::hand_eye::feature_tracks::FeatureTrack;
-use crate::calibration::hand_eye::refinement::{HandPoses, shifted};
+use crate::calibration::hand_eye::epipolar_search::REACH_MM;
+use crate::calibration::hand_eye::hand_poses::HandPoses;
+use crate::calibration::hand_eye::reprojection::shifted;
+use crate::calibration::hand_eye::view_pairs::{ViewPair, essential, sampson};
 use crate::camera::model::CameraModel;
 use crate::geometry::space::{Camera, Hand, RobotBase};
 use crate::geometry::transform::Transform;
 use crate::solver::least_squares::{self, Problem, Solution, minimize};
 use crate::solver::robust_loss::RobustLoss;
 
-/// Two views and the places that both see, as directions with z = 1.
-#[derive(Clone, Debug)]
-pub struct ViewPair {
-    /// The earlier view.
-    pub first: usize,
-    /// The later one.
-    pub second: usize,
-    /// Where each place is seen in the first and in the second.
-    pub rays: Vec<[Vector3<f64>; 2]>,
-    /// Per place: a track seen n times in p pairs tells 2n − 3 numbers, not p.
-    pub shares: Vec<f64>,
-}
-
-/// Views from one to the other in a pair.
-const STEPS: [usize; 4] = [1, 2, 4, 8];
-/// A pair with fewer places in common says little.
-const FEWEST_PLACES: usize = 8;
-
-/// Pairs of views from tracks.
-pub fn pairs(tracks: &[FeatureTrack], camera: &CameraModel) -> Vec<ViewPair> {
-    let mut pairs = std::collections::BTreeMap::<(usize, usize), ViewPair>::new();
-    for track in tracks {
-        let rays: Vec<(usize, Vector3<f64>)> = (track.places.iter())
-            .filter_map(|&(view, pixel)| Some((view, camera.unproject(pixel)?.coords)))
-            .collect();
-        let chosen: Vec<(usize, usize)> = (0..rays.len())
-            .flat_map(|i| (i + 1..rays.len()).map(move |j| (i, j)))
-            .filter(|&(i, j)| STEPS.contains(&(rays[j].0 - rays[i].0)))
-            .collect();
-        let share = ((2.0 * rays.len() as f64 - 3.0) / chosen.len().max(1) as f64).min(1.0);
-        for (i, j) in chosen {
-            let key = (rays[i].0, rays[j].0);
-            let pair = pairs.entry(key).or_insert_with(|| ViewPair {
-                first: key.0,
-                second: key.1,
-                rays: Vec::new(),
-                shares: Vec::new(),
-            });
-            pair.rays.push([rays[i].1, rays[j].1]);
-            pair.shares.push(share);
-        }
-    }
-    pairs.into_values().filter(|pair| pair.rays.len() >= FEWEST_PLACES).collect()
-}
-
-/// Rotations tried: about 12° from one to the next.
-const TRIED: usize = 4000;
-/// Of which so many are refined.
-const REFINED: usize = 48;
-/// Of which again so many are tried with errors of the arm.
+/// Of the answers begun with, so many are tried with errors of the arm.
 const TRIED_IN_FULL: usize = 6;
-/// Places of a pair that the search looks at.
-const LOOKED_AT: usize = 12;
-/// The search's robust width, as an angle.
-const SEARCH_WIDTH_RAD: f64 = 0.004;
-
-/// An X to begin with: nothing of it needs to be known.
-pub fn search(pairs: &[ViewPair], hands: &dyn HandPoses) -> Vec<Transform<Hand, Camera>> {
-    // Only pairs some way apart tell much.
-    let motions: Vec<(Transform<Hand, Hand>, &ViewPair)> = (pairs.iter())
-        .filter(|pair| pair.second - pair.first >= STEPS[1])
-        .filter_map(|pair| {
-            let [first, second] = [pair.first, pair.second].map(|view| hands.as_told(view, 0.0));
-            Some((second?.inverse() * first?, pair))
-        })
-        .collect();
-    let mut random = ChaCha8Rng::seed_from_u64(1);
-    let rotations: Vec<UnitQuaternion<f64>> = (0..TRIED)
-        .map(|_| {
-            let mut draw = || random.sample::<f64, _>(StandardNormal);
-            UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(draw(), draw(), draw(), draw()))
-        })
-        .collect();
-    let mut tried: Vec<(f64, Transform<Hand, Camera>)> = (rotations.par_iter())
-        .filter_map(|rotation| {
-            let shift = shift_for(rotation, &motions)?;
-            let x = Transform::new(*rotation, shift);
-            Some((misfit(&x, &motions), x))
-        })
-        .collect();
-    tried.sort_by(|a, b| a.0.total_cmp(&b.0));
-    tried.into_iter().take(REFINED).map(|(_, x)| x).collect()
-}
-
-/// A camera is within an arm's length of the hand: deviation along an axis. Without it, views that hardly tell X's shift let it run away.
-const REACH_MM: f64 = 300.0;
-
-/// For a rotation of X, nᵀ·R_Xᵀ·((R_A − 1)·t_X + t_A) = 0 for all places, n = (R_B·x_i) × x_j: least squares, twice, the second time
-/// with less weight for what fits badly. A weak prior keeps X within reach where the motion does not tell it.
-fn shift_for(rotation: &UnitQuaternion<f64>, motions: &[(Transform<Hand, Hand>, &ViewPair)]) -> Option<Vector3<f64>> {
-    let turn = rotation.to_rotation_matrix();
-    let mut shift = Vector3::zeros();
-    for round in 0..2 {
-        let (mut normal, mut right) = (Matrix3::identity() * (1e-3 / (REACH_MM * REACH_MM)), Vector3::zeros());
-        for (motion, pair) in motions {
-            let hand = motion.rotation().to_rotation_matrix();
-            let camera = turn.transpose() * hand * turn;
-            let lever: Matrix3<f64> = hand.matrix() - Matrix3::identity();
-            for [from, to] in spread(&pair.rays) {
-                let across = turn * (camera * from).cross(to);
-                let (row, constant) = (lever.transpose() * across, across.dot(&motion.translation()));
-                let weight = if round == 0 {
-                    1.0
-                } else {
-                    let off = row.dot(&shift) + constant;
-                    1.0 / (1.0 + (off / (across.norm() * motion.translation().norm() * 0.1 + 1e-12)).powi(2))
-                };
-                normal += weight * row * row.transpose();
-                right -= weight * constant * row;
-            }
-        }
-        shift = normal.cholesky()?.solve(&right);
-    }
-    Some(shift)
-}
-
-/// A few places of a pair: old tracks and young ones lie in different parts of the picture.
-fn spread(rays: &[[Vector3<f64>; 2]]) -> impl Iterator<Item = &[Vector3<f64>; 2]> {
-    rays.iter().step_by(rays.len().div_ceil(LOOKED_AT).max(1))
-}
-
-fn misfit(x: &Transform<Hand, Camera>, motions: &[(Transform<Hand, Hand>, &ViewPair)]) -> f64 {
-    let loss = RobustLoss::Cauchy { width: 1.0 };
-    (motions.iter())
-        .flat_map(|(motion, pair)| {
-            let essential = essential(&(x.inverse() * *motion * *x));
-            spread(&pair.rays).map(move |rays| sampson(&essential, rays) / SEARCH_WIDTH_RAD)
-        })
-        .map(|distance| loss.cost(distance * distance))
-        .sum()
-}
-
-/// E of `second_from_first`.
-pub fn essential(motion: &Transform<Camera, Camera>) -> Matrix3<f64> {
-    motion.translation().cross_matrix() * motion.rotation().to_rotation_matrix().matrix()
-}
-
-/// Signed distance of two places from fitting the motion, in units of the focal length.
-fn sampson(essential: &Matrix3<f64>, [from, to]: &[Vector3<f64>; 2]) -> f64 {
-    let (line, back) = (essential * from, essential.tr_mul(to));
-    let steepness = line.x * line.x + line.y * line.y + back.x * back.x + back.y * back.y;
-    to.dot(&line) / steepness.max(1e-24).sqrt()
-}
 
 /// What is known before.
 #[derive(Clone, Debug, PartialEq)]
@@ -530,8 +388,15 @@ impl Problem for Epipolar<'_> {
 
 #[cfg(test)]
 mod tests {
+    use rand::{RngExt as _, SeedableRng as _};
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::StandardNormal;
+
     use super::*;
+    use crate::calibration::hand_eye::epipolar_search::search;
     use crate::calibration::hand_eye::example::{Example, Noise, camera};
+    use crate::calibration::hand_eye::feature_tracks::FeatureTrack;
+    use crate::calibration::hand_eye::view_pairs::pairs;
     use crate::camera::intrinsics::Pixel;
     use crate::geometry::point::Point;
     use crate::geometry::space::Board;

@@ -9,48 +9,16 @@
 //! Pose errors and reprojection errors as objectives are compared by Tabb and Ahmad Yousef 2017 and by Ali et al. 2019; with the arm's
 //! errors as unknowns of their own the reprojection keeps the meaning that its covariance needs.
 
-use std::ops::Range;
+use nalgebra::{DMatrix, Matrix6, Vector6};
 
-use nalgebra::{DMatrix, Matrix6, UnitQuaternion, Vector3, Vector6};
-
-use crate::camera::intrinsics::Pixel;
+use crate::calibration::hand_eye::camera_prior::CameraPrior;
+use crate::calibration::hand_eye::hand_poses::HandPoses;
+use crate::calibration::hand_eye::reprojection::{POSES, Reprojection, Sighting, State, told};
+use crate::calibration::hand_eye::spread::{LEAST_SIGMAS, Spread};
 use crate::camera::model::CameraModel;
-use crate::geometry::point::Point;
 use crate::geometry::space::{Board, Camera, Hand, RobotBase};
 use crate::geometry::transform::Transform;
-use crate::solver::least_squares::{self, Problem, Solution, minimize};
-use crate::solver::robust_loss::RobustLoss;
-
-/// A corner of the board, and where a view shows it.
-#[derive(Clone, Copy, Debug)]
-pub struct Sighting {
-    /// On the board, mm.
-    pub corner: Point<Board>,
-    /// In the picture, with the lens.
-    pub pixel: Pixel,
-}
-
-/// Where the hand was at each view.
-pub trait HandPoses: Sync {
-    /// The hand at a view, had the arm's stamps `offset_s` added and its joints `offsets` (mm or rad). `None` where the arm does not say.
-    fn base_from_hand(&self, view: usize, offset_s: f64, offsets: &[f64]) -> Option<Transform<RobotBase, Hand>>;
-
-    /// Joints whose offsets can be found; 0 for an arm that tells poses only.
-    fn joints(&self) -> usize {
-        0
-    }
-
-    /// The hand at a view, its joints taken as told.
-    fn as_told(&self, view: usize, offset_s: f64) -> Option<Transform<RobotBase, Hand>> {
-        self.base_from_hand(view, offset_s, &vec![0.0; self.joints()])
-    }
-}
-
-impl HandPoses for Vec<Transform<RobotBase, Hand>> {
-    fn base_from_hand(&self, view: usize, _: f64, _: &[f64]) -> Option<Transform<RobotBase, Hand>> {
-        self.get(view).copied()
-    }
-}
+use crate::solver::least_squares::{self, Problem as _, Solution, minimize};
 
 /// What is sought besides X and Z, and what is known of it.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,6 +27,8 @@ pub struct Settings {
     pub time_offset: bool,
     /// Prior deviation of each joint's offset (mm or rad); none: joints are right.
     pub joint_sigma: Vec<f64>,
+    /// How far the camera's numbers may be off; none: it is right.
+    pub camera_prior: Option<CameraPrior>,
     /// First guess of how far the camera is from where the arm puts it, along an axis, mm.
     pub place_sigma_mm: f64,
     /// The same of its rotation about an axis, rad.
@@ -74,6 +44,7 @@ impl Default for Settings {
         Self {
             time_offset: false,
             joint_sigma: Vec::new(),
+            camera_prior: None,
             place_sigma_mm: 0.5,
             turn_sigma_rad: 0.003,
             pixel_sigma: 0.3,
@@ -93,10 +64,6 @@ const MIDDLE: f64 = 2.366;
 const UNHEARD: f64 = 1e-6;
 /// The deviations found no longer move by more than this share.
 const SETTLED: f64 = 0.01;
-/// Deviations never fall below these, mm, rad, px: with exact data the corrections would have no room for rounding.
-const LEAST_SIGMAS: [f64; 3] = [1e-4, 1e-6, 1e-4];
-/// A corner's residual counts in full up to so many deviations.
-const HUBER: f64 = 2.5;
 
 /// The answer, with its errors.
 #[derive(Clone, Debug)]
@@ -113,6 +80,10 @@ pub struct Refined {
     pub time_offset_s: [f64; 2],
     /// Per joint: offset to be added to its reading, and its deviation, mm or rad.
     pub joint_offsets: Vec<[f64; 2]>,
+    /// As given, or as adjusted.
+    pub camera: CameraModel,
+    /// Of its numbers, if they were adjusted, in the order of their prior.
+    pub camera_covariance: Option<DMatrix<f64>>,
     /// Per view, what the arm told wrongly of the camera: shift (mm) and rotation vector (rad) in the camera's space.
     pub corrections: Vec<Vector6<f64>>,
     /// Per view, whether its hand was elsewhere than the arm said: such a view is not heard.
@@ -147,12 +118,14 @@ pub fn refine(
         base_from_board,
         time_offset_s: 0.0,
         joints: vec![0.0; joints],
+        camera: (settings.camera_prior.as_ref()).map_or_else(|| camera.clone(), |prior| prior.begun(camera)),
         corrections: vec![Vector6::zeros(); views.len()],
     };
     let mut view_problem = Reprojection {
         views,
         hands,
         camera,
+        camera_prior: settings.camera_prior.as_ref(),
         first: &first,
         joint_sigma: &settings.joint_sigma[..joints],
         time_offset: settings.time_offset,
@@ -176,106 +149,7 @@ pub fn refine(
     view_problem.answer(solution)
 }
 
-#[derive(Clone, Debug)]
-struct State {
-    /// Where the arm puts the hand at each view, at the time and joint offsets below.
-    told: Vec<Option<Transform<RobotBase, Hand>>>,
-    hand_from_camera: Transform<Hand, Camera>,
-    base_from_board: Transform<RobotBase, Board>,
-    time_offset_s: f64,
-    joints: Vec<f64>,
-    corrections: Vec<Vector6<f64>>,
-}
-
-fn told(hands: &dyn HandPoses, views: usize, offset_s: f64, offsets: &[f64]) -> Vec<Option<Transform<RobotBase, Hand>>> {
-    (0..views).map(|view| hands.base_from_hand(view, offset_s, offsets)).collect()
-}
-
-struct Reprojection<'a> {
-    views: &'a [Vec<Sighting>],
-    hands: &'a dyn HandPoses,
-    camera: &'a CameraModel,
-    /// First residual of each view, and one past the last.
-    first: &'a [usize],
-    joint_sigma: &'a [f64],
-    time_offset: bool,
-    spread: Spread,
-    pixel_sigma: f64,
-    /// Weight of each view's prior.
-    trust: Vec<f64>,
-    outlier: Vec<bool>,
-    distance: Vec<f64>,
-    /// Degrees of freedom of Student's t; none: normal.
-    tail: Option<f64>,
-}
-
-/// What is known of a time offset before, so that stations at rest do not leave it undetermined, s.
-const TIME_OFFSET_SIGMA_S: f64 = 0.2;
-/// How the corrections spread: a joint's error moves and turns the camera at once, so shift and turn go together.
-struct Spread {
-    covariance: Matrix6<f64>,
-    information: Matrix6<f64>,
-    /// Turns a correction into standard deviations: the inverse of the covariance's lower root.
-    whitening: Matrix6<f64>,
-}
-
-/// A spread is held to be isotropic with the weight of so many views: few views do not tell how shift and turn go together.
-const ISOTROPIC_VIEWS: f64 = 8.0;
-
-impl Spread {
-    fn isotropic(place_mm: f64, turn_rad: f64) -> Option<Self> {
-        let [place, turn] = [place_mm.max(LEAST_SIGMAS[0]), turn_rad.max(LEAST_SIGMAS[1])].map(|sigma| sigma * sigma);
-        Self::of(Matrix6::from_diagonal(&Vector6::new(place, place, place, turn, turn, turn)))
-    }
-
-    /// From the sum over views of a correction's square.
-    fn learnt(sum: Matrix6<f64>, views: usize) -> Option<Self> {
-        let count = views as f64;
-        let variance = |first: usize| sum.fixed_view::<3, 3>(first, first).trace() / (3.0 * count);
-        let isotropic = Self::isotropic(variance(0).sqrt(), variance(3).sqrt())?;
-        Self::of((sum + ISOTROPIC_VIEWS * isotropic.covariance) / (count + ISOTROPIC_VIEWS))
-    }
-
-    fn of(covariance: Matrix6<f64>) -> Option<Self> {
-        let lower = covariance.cholesky()?.l();
-        let whitening = lower.try_inverse()?;
-        Some(Self {
-            covariance,
-            information: whitening.transpose() * whitening,
-            whitening,
-        })
-    }
-}
-
-/// Directions of X and Z.
-const POSES: usize = 12;
-
 impl Reprojection<'_> {
-    /// Directions before the corrections: X, Z, time, joints.
-    fn common(&self) -> usize {
-        POSES + usize::from(self.time_offset) + self.joint_sigma.len()
-    }
-
-    /// Where the camera was at a view.
-    fn eye(&self, state: &State, view: usize) -> Option<Transform<RobotBase, Camera>> {
-        let told = state.told.get(view).copied()??;
-        let correction: Transform<Camera, Camera> = shifted(&Transform::identity(), state.corrections[view].as_slice());
-        Some(told * state.hand_from_camera * correction)
-    }
-
-    /// Where a view shows a corner from a camera's pose, minus where it was seen, px.
-    fn residual(&self, state: &State, base_from_camera: &Transform<RobotBase, Camera>, sighting: &Sighting) -> Option<[f64; 2]> {
-        let camera_from_board = base_from_camera.inverse() * state.base_from_board;
-        let pixel = self.camera.project(camera_from_board * sighting.corner)?;
-        Some([pixel.x - sighting.pixel.x, pixel.y - sighting.pixel.y])
-    }
-
-    /// Place mm, turn rad, corner px.
-    fn sigmas(&self) -> [f64; 3] {
-        let variance = |first: usize| self.spread.covariance.fixed_view::<3, 3>(first, first).trace() / 3.0;
-        [variance(0).sqrt(), variance(3).sqrt(), self.pixel_sigma]
-    }
-
     /// The answer whose corrections spread as the prior says.
     fn settled(
         &mut self,
@@ -352,6 +226,9 @@ impl Reprojection<'_> {
             views += 1;
         }
         self.spread = Spread::learnt(sum, views)?;
+        if let Some(prior) = self.camera_prior {
+            held += prior.held(&self.camera_doubt(solution)?);
+        }
         // A corner within Huber's width counts in full; the residuals of Gaussian noise lose as many squares as there are unknowns, and
         // of the corrections only as many are the picture's as the prior does not hold.
         let rest: f64 = (solution.residuals.rows(0, self.measured()).iter().enumerate())
@@ -362,6 +239,12 @@ impl Reprojection<'_> {
         let free = (heard - unknowns).max(1.0);
         self.pixel_sigma = (self.pixel_sigma * (rest / free).sqrt()).max(LEAST_SIGMAS[2]);
         Some(())
+    }
+
+    /// Covariance of the camera's numbers.
+    fn camera_doubt(&self, solution: &Solution<State>) -> Option<DMatrix<f64>> {
+        let (at, count) = (self.first_lens(), self.lens());
+        Some(solution.covariance.as_ref()?.view((at, at), (count, count)).into_owned())
     }
 
     fn answer(&self, solution: Solution<State>) -> Option<Refined> {
@@ -389,6 +272,8 @@ impl Reprojection<'_> {
                 [0.0; 2]
             },
             joint_offsets: joint_offsets.collect(),
+            camera: state.camera.clone(),
+            camera_covariance: self.camera_prior.and_then(|_| self.camera_doubt(&solution)),
             corrections: state.corrections.clone(),
             outlier: self.outlier.clone(),
             distance: self.distance.clone(),
@@ -397,217 +282,23 @@ impl Reprojection<'_> {
             predicted_px: (0..self.views.len()).map(|view| self.rms_of(&without, view)).collect(),
         })
     }
-
-    /// Root mean square of a view's residual vectors, px.
-    fn rms_of(&self, state: &State, view: usize) -> f64 {
-        let Some(eye) = self.eye(state, view) else {
-            return f64::NAN;
-        };
-        let squares = (self.views[view].iter())
-            .map(|sighting| (self.residual(state, &eye, sighting)).map_or(f64::NAN, |[x, y]| x * x + y * y));
-        (squares.sum::<f64>() / self.views[view].len() as f64).sqrt()
-    }
-}
-
-impl Problem for Reprojection<'_> {
-    type State = State;
-
-    fn directions(&self) -> usize {
-        self.common() + 6 * self.views.len()
-    }
-
-    fn measured(&self) -> usize {
-        self.first[self.views.len()]
-    }
-
-    fn priors(&self) -> usize {
-        6 * self.views.len() + self.joint_sigma.len() + usize::from(self.time_offset)
-    }
-
-    fn loss(&self) -> RobustLoss {
-        RobustLoss::Huber { width: HUBER }
-    }
-
-    fn residuals(&self, state: &State, rows: Range<usize>, out: &mut [f64]) {
-        let measured = self.measured();
-        let mut row = rows.start;
-        while row < rows.end.min(measured) {
-            let view = self.first.partition_point(|&first| first <= row) - 1;
-            let eye = self.eye(state, view);
-            let end = self.first[view + 1].min(rows.end);
-            while row < end {
-                let sighting = &self.views[view][(row - self.first[view]) / 2];
-                let residual = eye
-                    .and_then(|eye| self.residual(state, &eye, sighting))
-                    .unwrap_or([f64::NAN; 2]);
-                // Blocks are asked for whole.
-                out[row - rows.start] = residual[0] / self.pixel_sigma;
-                out[row + 1 - rows.start] = residual[1] / self.pixel_sigma;
-                row += 2;
-            }
-        }
-        for row in row..rows.end {
-            let prior = row - measured;
-            out[row - rows.start] = match prior.checked_sub(6 * self.views.len()) {
-                Some(joint) if joint < self.joint_sigma.len() => state.joints[joint] / self.joint_sigma[joint],
-                Some(_) => state.time_offset_s / TIME_OFFSET_SIGMA_S,
-                None => {
-                    let (view, axis) = (prior / 6, prior % 6);
-                    let whitened = self.spread.whitening.row(axis).transpose().dot(&state.corrections[view]);
-                    self.trust[view].sqrt() * whitened
-                }
-            };
-        }
-    }
-
-    fn moved(&self, state: &State, step: &[f64]) -> State {
-        let common = self.common();
-        let first_joint = POSES + usize::from(self.time_offset);
-        let time_offset_s = state.time_offset_s + if self.time_offset { step[POSES] } else { 0.0 };
-        let joints: Vec<f64> = (state.joints.iter().zip(&step[first_joint..]))
-            .map(|(joint, step)| joint + step)
-            .collect();
-        // Asking the arm costs more than all the rest.
-        let told = if step[POSES..common].iter().all(|step| *step == 0.0) {
-            state.told.clone()
-        } else {
-            told(self.hands, self.views.len(), time_offset_s, &joints)
-        };
-        State {
-            told,
-            hand_from_camera: shifted(&state.hand_from_camera, &step[..6]),
-            base_from_board: shifted(&state.base_from_board, &step[6..POSES]),
-            time_offset_s,
-            joints,
-            corrections: (state.corrections.iter().zip(step[common..].chunks(6)))
-                .map(|(correction, step)| correction + Vector6::from_column_slice(step))
-                .collect(),
-        }
-    }
-
-    fn support(&self, direction: usize) -> Vec<Range<usize>> {
-        let (measured, common) = (self.measured(), self.common());
-        let own = |prior: usize| measured + prior..measured + prior + 1;
-        match direction.checked_sub(common) {
-            Some(correction) => {
-                let view = correction / 6;
-                let first = measured + 6 * view;
-                vec![self.first[view]..self.first[view + 1], first..first + 6]
-            }
-            None => match direction.checked_sub(POSES + usize::from(self.time_offset)) {
-                Some(joint) => vec![0..measured, own(6 * self.views.len() + joint)],
-                None if direction == POSES && self.time_offset => {
-                    vec![0..measured, own(6 * self.views.len() + self.joint_sigma.len())]
-                }
-                None => vec![0..measured],
-            },
-        }
-    }
-
-    fn small_step(&self, direction: usize) -> f64 {
-        // Samples of the arm lie milliseconds apart.
-        if self.time_offset && direction == POSES { 1e-4 } else { 1e-5 }
-    }
-}
-
-/// A pose whose origin is moved by the first three numbers (mm), and that is turned about it by the rotation vector of the others (rad),
-/// both in the space it leads to.
-pub(crate) fn shifted<To, From>(pose: &Transform<To, From>, by: &[f64]) -> Transform<To, From> {
-    let turn = UnitQuaternion::from_scaled_axis(Vector3::new(by[3], by[4], by[5]));
-    Transform::new(turn * pose.rotation(), pose.translation() + Vector3::new(by[0], by[1], by[2]))
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::DVector;
+    use nalgebra::{UnitQuaternion, Vector3};
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::StandardNormal;
 
     use super::*;
-    use crate::calibration::hand_eye::example::{Example, Noise, camera};
-    use crate::calibration::hand_eye::method::Method;
-    use crate::calibration::hand_eye::motion::Station;
-    use crate::calibration::hand_eye::robot_world::board_of;
-    use crate::robot::kinematics::{Arm, JointKind};
-
-    const PIXEL_SIGMA: f64 = 0.1;
-
-    struct Recorded {
-        example: Example,
-        views: Vec<Vec<Sighting>>,
-        hands: Vec<Transform<RobotBase, Hand>>,
-    }
-
-    /// Corners of a small board with noise, and hands whose joints were off by so much (0.1 mm in the slide), seen through the arm's
-    /// Jacobian at random postures.
-    fn recorded(seed: u64, count: usize, joint_rad: f64) -> Recorded {
-        let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5EED);
-        let example = Example::new(seed, count, Noise::NONE);
-        let arm = Arm::aesop_3000().unwrap();
-        let mut views = Vec::new();
-        let mut hands = Vec::new();
-        for station in &example.stations {
-            let corners = (0..20).map(|i| Point::new(f64::from(i % 5) * 8.0, f64::from(i / 5) * 8.0, 0.0));
-            let sightings = corners.map(|corner| {
-                let pixel = camera().project(station.camera_from_board * corner).unwrap();
-                let mut noise = || PIXEL_SIGMA * random.sample::<f64, _>(StandardNormal);
-                let pixel = Pixel {
-                    x: pixel.x + noise(),
-                    y: pixel.y + noise(),
-                };
-                Sighting { corner, pixel }
-            });
-            views.push(sightings.collect());
-            let posture: Vec<f64> = (arm.joints().iter())
-                .map(|joint| joint.limits[0] + random.random::<f64>() * (joint.limits[1] - joint.limits[0]))
-                .collect();
-            let off = DVector::from_iterator(
-                posture.len(),
-                arm.joints().iter().map(|joint| {
-                    let sigma = if joint.kind == JointKind::Prismatic && joint_rad > 0.0 {
-                        0.1
-                    } else {
-                        joint_rad
-                    };
-                    sigma * random.sample::<f64, _>(StandardNormal)
-                }),
-            );
-            let twist = arm.jacobian(&posture).unwrap() * off;
-            hands.push(shifted(&station.base_from_hand, twist.as_slice()));
-        }
-        Recorded { example, views, hands }
-    }
-
-    impl Recorded {
-        fn start(&self) -> (Transform<Hand, Camera>, Transform<RobotBase, Board>) {
-            let stations: Vec<Station> = (self.example.stations.iter().zip(&self.hands))
-                .map(|(station, &base_from_hand)| Station {
-                    base_from_hand,
-                    ..*station
-                })
-                .collect();
-            let hand_from_camera = Method::Park.solve(&stations).unwrap();
-            (hand_from_camera, board_of(&stations, &hand_from_camera).unwrap())
-        }
-
-        fn refined(&self, settings: &Settings) -> Refined {
-            refine(&self.views, &self.hands, &camera(), self.start(), settings).unwrap()
-        }
-
-        /// The truth minus the answer, in the directions of the covariance.
-        fn error(&self, refined: &Refined) -> Vector6<f64> {
-            let (truth, found) = (self.example.hand_from_camera, refined.hand_from_camera);
-            let turn = (truth.rotation() * found.rotation().inverse()).scaled_axis();
-            let shift = truth.translation() - found.translation();
-            Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z)
-        }
-    }
+    use crate::calibration::hand_eye::example::{PIXEL_SIGMA, Recorded, camera};
+    use crate::calibration::hand_eye::reprojection::shifted;
 
     #[test]
     fn with_an_exact_arm_only_the_corners_noise_is_left() {
         for seed in 0..5 {
-            let recorded = recorded(seed, 20, 0.0);
+            let recorded = Recorded::new(seed, 20, 0.0);
             let refined = recorded.refined(&Settings::default());
             let [mm, rad] = recorded.example.error_of(&refined.hand_from_camera);
             assert!(mm < 0.05 && rad.to_degrees() < 0.02, "{seed}: {mm} mm, {}°", rad.to_degrees());
@@ -639,7 +330,7 @@ mod tests {
     fn covered(runs: u64) {
         let (mut inside, mut square) = (0, 0.0);
         for seed in 0..runs {
-            let recorded = recorded(100 + seed, 20, 0.05_f64.to_radians());
+            let recorded = Recorded::new(100 + seed, 20, 0.05_f64.to_radians());
             let refined = recorded.refined(&Settings::default());
             let [mm, rad] = recorded.example.error_of(&refined.hand_from_camera);
             assert!(mm < 1.0 && rad.to_degrees() < 0.2, "{seed}: {mm} mm, {}°", rad.to_degrees());
@@ -655,7 +346,7 @@ mod tests {
 
     #[test]
     fn a_view_whose_hand_was_elsewhere_is_found_and_let_go() {
-        let mut recorded = recorded(7, 12, 0.02_f64.to_radians());
+        let mut recorded = Recorded::new(7, 12, 0.02_f64.to_radians());
         let right = recorded.refined(&Settings::default());
         recorded.hands[4] = shifted(&recorded.hands[4], &[4.0, -3.0, 2.0, 0.02, 0.0, -0.015]);
         let refined = recorded.refined(&Settings::default());
@@ -701,7 +392,7 @@ mod tests {
                 2
             }
         }
-        let recorded = recorded(9, 24, 0.0);
+        let recorded = Recorded::new(9, 24, 0.0);
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let moving = Moving {
             told: recorded.hands.clone(),

@@ -8,5 +8,7 @@ pub mod camera_path;
 pub mod drift;
 pub mod image_motion;
 pub mod offset;
+mod path_deviation;
+mod path_matching;
 pub mod path_offset;
 pub mod plot;

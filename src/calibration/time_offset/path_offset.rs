@@ -12,43 +12,18 @@
 //! covariances H⁻¹SH⁻¹ whose S sums the scores' products over windows of several lengths (Newey and West 1987, "A simple, positive
 //! semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", doi:10.2307/1913610).
 
-use nalgebra::{Isometry3, SMatrix, SVector, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{UnitQuaternion, Vector3};
 use rayon::prelude::*;
 
 use crate::calibration::time_offset::camera_path::CameraPath;
-use crate::geometry::alignment::{PosePair, Scale, Similarity};
+use crate::calibration::time_offset::path_matching::{COARSE_MS, FEWEST_READINGS, Fit, Matching, OffsetIs};
 use crate::geometry::space::{Camera, Hand};
 use crate::geometry::transform::Transform;
 use crate::robot::trajectory::TimedPose;
 use crate::time::{Span, Timestamp};
 
-/// τ (ms), G (rotation, translation, logarithm of the scale), X (rotation, translation).
-const UNKNOWNS: usize = 14;
-/// Of the coarse search, ms.
-const COARSE_MS: f64 = 10.0;
-/// How well the hand-eye transform is known at least, mm and rad.
-const HAND_EYE_MM: f64 = 2.0;
-const HAND_EYE_RAD: f64 = 0.009;
-/// Weights of mm against rad in the first alignment only: noise of a typical arm.
-const FIRST_MM: f64 = 0.3;
-const FIRST_RAD: f64 = 0.0015;
-/// Squared residual of a reading (χ² of 6) at which its weight has halved.
-const HALF_WEIGHT: f64 = 25.0;
-const ROUNDS: usize = 25;
-const COARSE_ROUNDS: usize = 3;
-const COARSE_READINGS: usize = 200;
-/// Fewer readings than this tell nothing.
-const FEWEST_READINGS: usize = 24;
-/// Lengths of the sandwich's windows, s.
-const ALIKE_S: [f64; 4] = [0.08, 0.16, 0.32, 0.64];
-/// So many windows are needed for their sum to mean anything.
-const FEWEST_WINDOWS: f64 = 6.0;
-/// Into how many parts the readings are cut to see whether they agree.
-const PARTS: usize = 3;
 /// Half width of what counts as the peak itself when rivals are looked for, ms.
 const PEAK_MS: f64 = 60.0;
-/// Looked at for the derivative by τ, ms.
-const NEAR_MS: f64 = 2.0;
 
 /// The offset found, and how sure it is.
 #[derive(Clone, Debug)]
@@ -212,272 +187,7 @@ pub fn estimate(
     })
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum OffsetIs {
-    Held,
-    Sought,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct State {
-    offset_ms: f64,
-    gauge: Similarity,
-    hand_from_camera: Isometry3<f64>,
-}
-
-impl State {
-    fn moved(&self, step: &SVector<f64, UNKNOWNS>) -> Self {
-        let three = |from: usize| Vector3::new(step[from], step[from + 1], step[from + 2]);
-        let turned = |by: Vector3<f64>, rotation: UnitQuaternion<f64>| UnitQuaternion::from_scaled_axis(by) * rotation;
-        Self {
-            offset_ms: self.offset_ms + step[0],
-            gauge: Similarity {
-                rotation: turned(three(1), self.gauge.rotation),
-                translation: self.gauge.translation + three(4),
-                scale: self.gauge.scale * step[7].clamp(-1.0, 1.0).exp(),
-            },
-            hand_from_camera: Isometry3::from_parts(
-                (self.hand_from_camera.translation.vector + three(11)).into(),
-                turned(three(8), self.hand_from_camera.rotation),
-            ),
-        }
-    }
-}
-
-#[derive(Clone, Copy, Debug)]
-struct Fit {
-    state: State,
-    /// Of a reading per axis, mm and rad.
-    noise: [f64; 2],
-    /// Mean logarithm of the residuals' variances, summed over the six axes.
-    mean_log_noise: f64,
-    count: usize,
-}
-
-struct Matching<'a> {
-    path: &'a CameraPath,
-    arm: &'a [TimedPose],
-    hand_from_camera: Isometry3<f64>,
-}
-
-/// The normal equations and what they were made of.
-struct Normal {
-    matrix: SMatrix<f64, UNKNOWNS, UNKNOWNS>,
-    side: SVector<f64, UNKNOWNS>,
-    readings: Vec<Heard>,
-}
-
-/// A reading in the normal equations.
-struct Heard {
-    at: Timestamp,
-    /// In deviations.
-    residual: Vector6<f64>,
-    /// Times its weight.
-    slopes: SMatrix<f64, 6, UNKNOWNS>,
-}
-
 impl Matching<'_> {
-    /// Readings at which the camera's path is known, with room for the derivative.
-    fn readings(&self, offset_ms: f64) -> impl Iterator<Item = &TimedPose> {
-        let at = move |reading: &TimedPose, ms: f64| reading.stamp + Span::from_milliseconds(offset_ms + ms);
-        let poses = self.path.poses();
-        let ends = poses.first().zip(poses.last()).map(|(first, last)| (first.at, last.at));
-        let inside = move |instant: Timestamp| ends.is_some_and(|(first, last)| instant >= first && instant <= last);
-        // The path's end pieces are bent by what is beyond them; a step inside is enough room for the search as well.
-        (self.arm.iter()).filter(move |reading| inside(at(reading, -NEAR_MS)) && inside(at(reading, NEAR_MS)))
-    }
-
-    fn fitted(&self, offset_ms: f64, offset_is: OffsetIs) -> Option<Fit> {
-        // The coarse search looks at some of the readings only, and need not settle.
-        let (every, rounds) = match offset_is {
-            OffsetIs::Held => (self.arm.len().div_ceil(COARSE_READINGS).max(1), COARSE_ROUNDS),
-            OffsetIs::Sought => (1, ROUNDS),
-        };
-        let used: Vec<TimedPose> = (self.readings(offset_ms))
-            .step_by(every)
-            .copied()
-            .filter(|reading| self.path.at(reading.stamp + Span::from_milliseconds(offset_ms)).is_some())
-            .collect();
-        if used.len() < FEWEST_READINGS {
-            return None;
-        }
-        let pairs: Vec<PosePair> = (used.iter())
-            .filter_map(|reading| {
-                let camera = self.path.at(reading.stamp + Span::from_milliseconds(offset_ms))?;
-                Some(PosePair {
-                    fixed: reading.base_from_hand.isometry() * self.hand_from_camera,
-                    moving: *camera.isometry(),
-                    per_mm2: FIRST_MM.powi(-2),
-                    per_rad2: FIRST_RAD.powi(-2),
-                })
-            })
-            .collect();
-        let mut state = State {
-            offset_ms,
-            gauge: Similarity::between(&pairs, Scale::Free)?,
-            hand_from_camera: self.hand_from_camera,
-        };
-        let mut noise = self.noise(&state, &used)?;
-        for _ in 0..rounds {
-            let mut normal = self.normal(&state, &used, noise);
-            if offset_is == OffsetIs::Held {
-                normal.matrix.row_mut(0).fill(0.0);
-                normal.matrix.column_mut(0).fill(0.0);
-                normal.matrix[(0, 0)] = 1.0;
-                normal.side[0] = 0.0;
-            }
-            let mut step = -normal.matrix.cholesky()?.solve(&normal.side);
-            if !step.iter().all(|s| s.is_finite()) || step[0].abs() > 500.0 {
-                return None;
-            }
-            step[0] = step[0].clamp(-COARSE_MS, COARSE_MS);
-            state = state.moved(&step);
-            let before = noise;
-            noise = self.noise(&state, &used)?;
-            let settled = step[0].abs() < 1e-3 && (noise[0] / before[0]).ln().abs() + (noise[1] / before[1]).ln().abs() < 1e-4;
-            if settled {
-                break;
-            }
-        }
-        let residuals: Vec<Vector6<f64>> = used.iter().filter_map(|reading| self.residual(&state, reading)).collect();
-        Some(Fit {
-            state,
-            noise,
-            mean_log_noise: mean_log_noise(&residuals),
-            count: residuals.len(),
-        })
-    }
-
-    /// Of a reading: place (mm) and turn (rad) in the hand's axes, as they should be less as they are read.
-    fn residual(&self, state: &State, reading: &TimedPose) -> Option<Vector6<f64>> {
-        let camera = self.path.at(reading.stamp + Span::from_milliseconds(state.offset_ms))?;
-        let hand = state.gauge.moved(camera.isometry()) * state.hand_from_camera.inverse();
-        let read = reading.base_from_hand.isometry();
-        let inverse = read.rotation.inverse();
-        let place = inverse * (hand.translation.vector - read.translation.vector);
-        let turn = (inverse * hand.rotation).scaled_axis();
-        Some(Vector6::new(place.x, place.y, place.z, turn.x, turn.y, turn.z))
-    }
-
-    /// Robust deviations of a reading, mm and rad: 1.4826 times the median size of a Gaussian's residuals.
-    fn noise(&self, state: &State, used: &[TimedPose]) -> Option<[f64; 2]> {
-        let mut sizes = [Vec::new(), Vec::new()];
-        for residual in used.iter().filter_map(|reading| self.residual(state, reading)) {
-            for (axis, value) in residual.iter().enumerate() {
-                sizes[axis / 3].push(value.abs());
-            }
-        }
-        let [mm, rad] = sizes.map(|mut sizes| {
-            sizes.sort_by(f64::total_cmp);
-            sizes.get(sizes.len() / 2).copied()
-        });
-        Some([(1.4826 * mm?).max(1e-4), (1.4826 * rad?).max(1e-6)])
-    }
-
-    fn normal(&self, state: &State, used: &[TimedPose], noise: [f64; 2]) -> Normal {
-        let steps: [f64; UNKNOWNS] = [
-            NEAR_MS, 1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2, 1e-4, 1e-4, 1e-4, 1e-4, 1e-2, 1e-2, 1e-2,
-        ];
-        let near: Vec<[State; 2]> = (0..UNKNOWNS)
-            .map(|unknown| {
-                [1.0, -1.0].map(|sign| {
-                    let mut step = SVector::<f64, UNKNOWNS>::zeros();
-                    step[unknown] = sign * steps[unknown];
-                    state.moved(&step)
-                })
-            })
-            .collect();
-        let mut normal = Normal {
-            matrix: SMatrix::zeros(),
-            side: SVector::zeros(),
-            readings: Vec::with_capacity(used.len()),
-        };
-        let whitening = Vector6::from_fn(|axis, _| 1.0 / noise[axis / 3]);
-        for reading in used {
-            let Some(residual) = self.residual(state, reading) else {
-                continue;
-            };
-            let residual = residual.component_mul(&whitening);
-            let mut slopes = SMatrix::<f64, 6, UNKNOWNS>::zeros();
-            for (unknown, [plus, minus]) in near.iter().enumerate() {
-                if let (Some(plus), Some(minus)) = (self.residual(plus, reading), self.residual(minus, reading)) {
-                    slopes.set_column(unknown, &((plus - minus).component_mul(&whitening) / (2.0 * steps[unknown])));
-                }
-            }
-            let weight = 1.0 / (1.0 + residual.norm_squared() / HALF_WEIGHT);
-            normal.matrix += weight * slopes.transpose() * slopes;
-            normal.side += weight * slopes.transpose() * residual;
-            normal.readings.push(Heard {
-                at: reading.stamp,
-                residual,
-                slopes: slopes * weight,
-            });
-        }
-        // What is known of the hand-eye transform.
-        let turned = (state.hand_from_camera.rotation * self.hand_from_camera.rotation.inverse()).scaled_axis();
-        let moved = state.hand_from_camera.translation.vector - self.hand_from_camera.translation.vector;
-        for axis in 0..3 {
-            for (unknown, value, sigma) in [(8 + axis, turned[axis], HAND_EYE_RAD), (11 + axis, moved[axis], HAND_EYE_MM)] {
-                normal.matrix[(unknown, unknown)] += sigma.powi(-2);
-                normal.side[unknown] += value * sigma.powi(-2);
-            }
-        }
-        normal
-    }
-
-    /// Of the offset, ms: if errors were independent, and as they are.
-    fn deviations(&self, fit: &Fit) -> Option<[f64; 2]> {
-        let used: Vec<TimedPose> = self.readings(fit.state.offset_ms).copied().collect();
-        let Normal { matrix, readings, .. } = self.normal(&fit.state, &used, fit.noise);
-        let covariance = matrix.try_inverse()?;
-        let row = covariance.row(0);
-        let white = covariance[(0, 0)].sqrt();
-        // By how much a reading's residuals, one deviation each, move the offset.
-        let levers: Vec<Vector6<f64>> = readings.iter().map(|heard| heard.slopes * row.transpose()).collect();
-        let whole_s = (readings.last()?.at - readings.first()?.at).seconds();
-        // The fit has taken part of the errors with it.
-        let left = (1.0 - UNKNOWNS as f64 / (6.0 * readings.len() as f64)).max(0.1);
-        let mut worst = white.max((correlated(&readings, &levers) / left).sqrt());
-        for window_s in ALIKE_S.into_iter().filter(|window_s| FEWEST_WINDOWS * window_s <= whole_s) {
-            let mut sum = 0.0;
-            for (i, (heard, lever)) in readings.iter().zip(&levers).enumerate() {
-                let own = lever.dot(&heard.residual);
-                sum += own * own;
-                for (later, lever) in readings.iter().zip(&levers).skip(i + 1) {
-                    // Bartlett's weights keep the sum from turning negative.
-                    let weight = 1.0 - (later.at - heard.at).seconds() / window_s;
-                    if weight <= 0.0 {
-                        break;
-                    }
-                    sum += 2.0 * weight * own * lever.dot(&later.residual);
-                }
-            }
-            worst = worst.max((sum.max(0.0) / left / (1.0 - window_s / whole_s)).sqrt());
-        }
-        (white.is_finite() && worst.is_finite()).then_some([white, worst])
-    }
-
-    /// By how many times the offsets of the parts, each with a similarity of its own, differ more than they should; 1 where they agree. A
-    /// path that is bent over seconds gives itself away by it (Birge 1932, as with stretches).
-    fn scatter_of_parts(&self, offset_ms: f64) -> f64 {
-        let used: Vec<TimedPose> = self.readings(offset_ms).copied().collect();
-        let found: Vec<[f64; 2]> = (used.chunks(used.len().div_ceil(PARTS).max(1)))
-            .filter_map(|arm| {
-                let part = Matching { arm, ..*self };
-                let fit = part.fitted(offset_ms, OffsetIs::Sought)?;
-                Some([fit.state.offset_ms, part.deviations(&fit)?[1]])
-            })
-            .collect();
-        if found.len() < 2 {
-            return 1.0;
-        }
-        let weights: f64 = found.iter().map(|[_, sigma]| sigma.powi(-2)).sum();
-        let mean = found.iter().map(|[ms, sigma]| ms * sigma.powi(-2)).sum::<f64>() / weights;
-        let misfit: f64 = found.iter().map(|[ms, sigma]| ((ms - mean) / sigma).powi(2)).sum();
-        let scatter = (misfit / (found.len() - 1) as f64).sqrt();
-        if scatter.is_finite() { scatter.max(1.0) } else { 1.0 }
-    }
-
     /// Share of the variance of place and of turn that is no residual; the worse of the two.
     fn explained(&self, fit: &Fit) -> f64 {
         let used: Vec<&TimedPose> = self.readings(fit.state.offset_ms).collect();
@@ -527,64 +237,16 @@ impl Matching<'_> {
     }
 }
 
-/// Variance of the offset if neighbouring readings' errors are as alike as their residuals are on the average of all axes; where lags
-/// beyond the first tell less than a first-order process would, that process counts.
-fn correlated(readings: &[Heard], levers: &[Vector6<f64>]) -> f64 {
-    let whole: f64 = readings
-        .iter()
-        .map(|heard| heard.residual.norm_squared())
-        .sum::<f64>()
-        .max(1e-12);
-    let chance = 2.0 / (6.0 * readings.len() as f64).sqrt();
-    let alike_at = |lag: usize| {
-        let pairs = readings.iter().zip(readings.iter().skip(lag));
-        pairs.map(|(a, b)| a.residual.dot(&b.residual)).sum::<f64>() / whole
-    };
-    let mut variance: f64 = levers.iter().map(Vector6::norm_squared).sum();
-    let first = alike_at(1);
-    if first < chance {
-        return variance;
-    }
-    // What the fit took with it was the most alike of all: half of what chance may do is added again.
-    let process = (first + 0.5 * chance).min(0.995);
-    let mut measured = true;
-    for lag in 1..readings.len() / 2 {
-        let here = alike_at(lag);
-        measured &= here > chance;
-        let alike = if measured {
-            here.max(process.powi(lag as i32))
-        } else {
-            process.powi(lag as i32)
-        };
-        if alike < 0.5 * chance {
-            break;
-        }
-        variance += 2.0 * alike * levers.iter().zip(&levers[lag..]).map(|(a, b)| a.dot(b)).sum::<f64>();
-    }
-    variance
-}
-
-/// Mean logarithm of the variances of place and turn, three axes each, without the worst tenth.
-fn mean_log_noise(residuals: &[Vector6<f64>]) -> f64 {
-    [0, 3]
-        .map(|first| {
-            let mut squares: Vec<f64> = residuals.iter().map(|r| r.fixed_rows::<3>(first).norm_squared()).collect();
-            squares.sort_by(f64::total_cmp);
-            squares.truncate((squares.len() - squares.len() / 10).max(1));
-            3.0 * (squares.iter().sum::<f64>() / squares.len() as f64).max(1e-18).ln()
-        })
-        .iter()
-        .sum()
-}
-
 #[cfg(test)]
 mod tests {
+    use nalgebra::Vector6;
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::StandardNormal;
 
     use super::*;
     use crate::calibration::time_offset::camera_path::PosedPicture;
+    use crate::geometry::alignment::Similarity;
     use crate::geometry::space::{RobotBase, World};
 
     const LATE_MS: f64 = 37.0;

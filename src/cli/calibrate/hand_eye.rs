@@ -1,15 +1,18 @@
 //! `calibrate hand-eye`: how the camera sits on the arm, from a board seen from many stations.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::calibration::board::detection::{Detection, detect};
 use crate::calibration::board::pattern::BoardLayout;
 use crate::calibration::camera::pose::board_pose;
 use crate::calibration::hand_eye::calibrate::{StationView, calibrate};
+use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::plot::{self, Drawn};
-use crate::calibration::hand_eye::refinement::{HandPoses, Refined, Settings, Sighting};
+use crate::calibration::hand_eye::refinement::{Refined, Settings};
+use crate::calibration::hand_eye::reprojection::Sighting;
 use crate::camera::file;
 use crate::camera::model::CameraModel;
+use crate::cli::calibrate::hand_eye_camera::{self, CameraChange, Known};
 use crate::cli::calibrate::hand_eye_report::{Report, listed};
 use crate::cli::calibrate::hand_eye_scene;
 use crate::cli::calibrate::hands::{Hands, joint_sigmas};
@@ -37,7 +40,7 @@ const LEAST_CORNERS: usize = 6;
 
 Rest the arm at ten to thirty stations before a board that lies still; tilt the scope by 20° and more to all sides and roll it.
 Without a board, a survey of any still scene with texture will do; the answer is less sure.
-Beside hand_eye.yaml are written hand_eye_report.json and hand_eye_report.png.")]
+Beside hand_eye.yaml are written hand_eye_report.json and hand_eye_report.png, with --refine-camera also hand_eye_camera.yaml.")]
 pub struct Args {
     /// A recording: pictures, frames.csv, and poses.tum or joints.csv.
     #[arg(required_unless_present = "images", conflicts_with = "images")]
@@ -69,6 +72,10 @@ pub struct Args {
     /// How far joints may be off constantly, degrees (mm for a slide at ten times the number); 0 does not look for offsets.
     #[arg(long, value_name = "DEG", default_value_t = 0.0)]
     joint_offsets_deg: f64,
+    /// Adjust the camera too, within what camera_report.json beside its file says of it (else 1 %), and let the answer's deviations allow
+    /// for its doubt; needs a board.
+    #[arg(long)]
+    pub(super) refine_camera: bool,
     /// Hand-eye file to write.
     #[arg(short, long, default_value = "hand_eye.yaml", value_name = "FILE")]
     pub(super) output: PathBuf,
@@ -81,11 +88,19 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     };
     let layout = BoardLayout::new(board, square_mm).map_err(|error| UsageError(error.to_string()))?;
     let [report_path, plot_path] = ["_report.json", "_report.png"].map(|ending| super::beside(&args.output, ending));
-    for path in [&args.output, &report_path, &plot_path] {
+    let refined_path = super::beside(&args.output, "_camera.yaml");
+    for path in [&args.output, &report_path, &plot_path]
+        .into_iter()
+        .chain(args.refine_camera.then_some(&refined_path))
+    {
         context.refuse_overwriting(path)?;
     }
     let recorded = args.recording.as_deref().map(Recording::open).transpose()?;
     let camera = camera_of(args, recorded.as_ref())?;
+    let camera_file = (args.camera.clone())
+        .or_else(|| Some(args.recording.as_ref()?.join("camera.yaml")))
+        .unwrap_or_default();
+    let known = (args.refine_camera).then(|| Known::of(&camera, &camera_file)).transpose()?;
     let inputs = args.recording.iter().chain(&args.images).cloned().collect::<Vec<_>>();
     let seen = look_at_all(&inputs, args.frames as usize, &context.console, &|image| {
         detect(image, &layout)
@@ -102,7 +117,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     }
     let arm = match &recorded {
         Some(recording) => {
-            let folder = args.recording.as_deref().unwrap_or(std::path::Path::new("."));
+            let folder = args.recording.as_deref().unwrap_or(Path::new("."));
             let frames: Vec<u64> = seen.iter().map(|seen| seen.frame).collect();
             Hands::of_recording((folder, recording), args.arm.as_deref(), &frames, context)?
         }
@@ -120,10 +135,12 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let settings = Settings {
         time_offset: matches!(hands, Hands::Timed { .. } | Hands::Jointed { .. }),
         joint_sigma: joint_sigmas(&hands, args.joint_offsets_deg),
+        camera_prior: known.as_ref().map(|known| known.prior.clone()),
         ..Settings::default()
     };
     let refined = calibrate(&views, &hands, &camera, &settings)?;
-    let report = Report::new(&refined, &views, &hands, &camera, &settings, &names, without);
+    let change = known.and_then(|known| CameraChange::new(&refined, &camera, &known));
+    let report = Report::new(&refined, &views, &hands, &camera, &settings, &names, without, change);
     let hand_eye = HandEye {
         time_offset: settings.time_offset.then(|| Span::from_seconds(refined.time_offset_s[0])),
         covariance: Some(refined.covariance),
@@ -131,10 +148,15 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     };
     hand_eye.write(&args.output)?;
     super::write_json(&report_path, &serde_json::to_value(&report)?)?;
-    let drawn = drawn(&refined, &views, &hands, &camera, &report);
+    let drawn = drawn(&refined, &views, &hands, &report);
     image_files::write(&plot_path, &plot::drawn((camera.width, camera.height), &drawn))?;
+    let mut written: Vec<&Path> = vec![&args.output, &report_path, &plot_path];
+    if args.refine_camera {
+        hand_eye_camera::write(&refined_path, &refined.camera, &camera_file)?;
+        written.push(&refined_path);
+    }
     console::print(&report.table())?;
-    super::say_written(&[&args.output, &report_path, &plot_path])?;
+    super::say_written(&written)?;
     Ok(Ended::Complete)
 }
 
@@ -216,7 +238,7 @@ fn matched(
 }
 
 /// What each view saw, and where the arm alone puts it.
-fn drawn(refined: &Refined, views: &[StationView], hands: &Hands, camera: &CameraModel, report: &Report) -> Vec<Drawn> {
+fn drawn(refined: &Refined, views: &[StationView], hands: &Hands, report: &Report) -> Vec<Drawn> {
     let offsets: Vec<f64> = refined.joint_offsets.iter().map(|offset| offset[0]).collect();
     let offsets = if offsets.is_empty() {
         vec![0.0; hands.joints()]
@@ -228,7 +250,7 @@ fn drawn(refined: &Refined, views: &[StationView], hands: &Hands, camera: &Camer
             let hand = hands.base_from_hand(view, refined.time_offset_s[0], &offsets);
             let camera_from_board = hand.map(|hand| (hand * refined.hand_from_camera).inverse() * refined.base_from_board);
             let corners = seen.sightings.iter().map(|sighting| {
-                let predicted = camera_from_board.and_then(|pose| camera.project(pose * sighting.corner));
+                let predicted = camera_from_board.and_then(|pose| refined.camera.project(pose * sighting.corner));
                 (sighting.pixel, predicted)
             });
             Drawn {

@@ -6,11 +6,13 @@ use anyhow::Context as _;
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use crate::calibration::hand_eye::epipolar::{FromScene, Settings, ViewPair, essential, pairs, refine, search};
+use crate::calibration::hand_eye::epipolar::{FromScene, Settings, refine};
+use crate::calibration::hand_eye::epipolar_search::search;
 use crate::calibration::hand_eye::feature_tracks::{FeatureTrack, FeatureTracker};
+use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::calibration::hand_eye::motion::{Demands, Station, check};
 use crate::calibration::hand_eye::plot::{self, Drawn};
-use crate::calibration::hand_eye::refinement::HandPoses;
+use crate::calibration::hand_eye::view_pairs::{ViewPair, essential, pairs};
 use crate::camera::model::CameraModel;
 use crate::cli::calibrate::hand_eye::{Args, camera_of};
 use crate::cli::calibrate::hand_eye_report::Placement;
@@ -68,6 +70,14 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         .recording
         .as_deref()
         .ok_or_else(|| UsageError("expected a recording to calibrate from, or --board with --square-mm and --images".into()))?;
+    if args.refine_camera {
+        return Err(UsageError(
+            "--refine-camera needs a board: tracks of a scene do not tell the camera from the arm's errors; add --board and --square-mm, or \
+             leave it out"
+                .into(),
+        )
+        .into());
+    }
     let [report_path, plot_path] = ["_report.json", "_report.png"].map(|ending| super::beside(&args.output, ending));
     for path in [&args.output, &report_path, &plot_path] {
         context.refuse_overwriting(path)?;

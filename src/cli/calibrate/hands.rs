@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 
-use crate::calibration::hand_eye::refinement::HandPoses;
+use crate::calibration::hand_eye::hand_poses::HandPoses;
 use crate::cli::context::Context;
 use crate::geometry::space::{Hand, RobotBase};
 use crate::geometry::transform::Transform;

@@ -4,6 +4,7 @@ pub mod camera;
 pub mod camera_path;
 pub mod color;
 pub mod hand_eye;
+pub mod hand_eye_camera;
 pub mod hand_eye_report;
 pub mod hand_eye_scene;
 pub mod hands;
