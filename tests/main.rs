@@ -11,6 +11,7 @@ mod bad_input;
 mod calibrate_color;
 mod calibration;
 mod camera;
+mod camera_source;
 mod cli;
 mod color;
 mod config;
