@@ -14,11 +14,12 @@ use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::color_normalization::color_file::ColorFile;
 use crate::stages::color_normalization::stage::ColorNormalization;
 use crate::stages::pose_refinement::PoseRefinement;
-use crate::stages::pose_stamping::PoseStamping;
+use crate::stages::pose_stamping::{PoseStamping, Poses};
 use crate::stages::specularity_detection::SpecularityDetection;
 use crate::stages::specularity_substitution::stage::SpecularitySubstitution;
 use crate::stages::temporal_median::stage::TemporalMedian;
 use crate::stages::undistortion::{self, Undistortion};
+use crate::stages::waiting::Waiting;
 use crate::stages::{color_normalization, temporal_median};
 use crate::time::Span;
 
@@ -74,6 +75,10 @@ pub struct Equipment<'a> {
     pub recording: &'a Recording,
     /// What other views saw.
     pub light_field: Option<Arc<LightField>>,
+    /// True when a light field is still on its way: its stages have their places in the line, for [`light_field_stages`] to take.
+    pub light_field_to_come: bool,
+    /// The arm's poses, where they are not the recording's as they stand there.
+    pub poses: Option<Poses>,
     /// Size of the pictures, px.
     pub size: (usize, usize),
 }
@@ -168,7 +173,7 @@ pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Re
 fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line: &mut Line) -> Result<(), ComposeError> {
     let recording = equipment.recording;
     let only_marked = "specularities are only found and marked 64 in the mask";
-    let lacking = if equipment.light_field.is_none() {
+    let lacking = if equipment.light_field.is_none() && !equipment.light_field_to_come {
         Some("no light field (--light-field LF)")
     } else if recording.camera.is_none() {
         Some("no camera.yaml beside the video")
@@ -178,38 +183,71 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
         None
     };
     line.stages.push(Box::new(SpecularityDetection::new(&config.specularity)));
-    let Some(light_field) = equipment.light_field.as_ref().filter(|_| lacking.is_none()) else {
-        if let Some(lacking) = lacking {
-            line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
-        }
+    if let Some(lacking) = lacking {
+        line.leave_out(Choice::Specular, format!("{lacking}, so {only_marked}"));
         line.stages
             .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
         return Ok(());
-    };
-    match (&recording.trajectory, &recording.hand_eye) {
-        (Some(trajectory), Some(hand_eye)) => {
-            let poses = PoseBuffer::from_trajectory(trajectory, &config.poses)?;
-            let mut stamping = PoseStamping::new(poses, hand_eye.clone());
-            if hand_eye.time_offset.is_none() && light_field.time_offset != Span(0) {
-                stamping = stamping.with_time_offset(light_field.time_offset);
+    }
+    let has_poses = equipment.poses.is_some() || recording.trajectory.is_some();
+    if !has_poses || recording.hand_eye.is_none() {
+        let missing = if has_poses { "hand_eye.yaml" } else { "poses.tum" };
+        line.leave_out(
+            Choice::Specular,
+            format!("no {missing} beside the video, so the camera is looked for in the picture alone"),
+        );
+    }
+    match &equipment.light_field {
+        Some(light_field) => line.stages.extend(light_field_stages(config, equipment, light_field)?),
+        None => {
+            if has_poses && recording.hand_eye.is_some() {
+                line.stages.push(Box::new(Waiting(POSE_STAMPING)));
             }
-            line.stages.push(Box::new(stamping));
-        }
-        (trajectory, _) => {
-            let missing = if trajectory.is_none() { "poses.tum" } else { "hand_eye.yaml" };
-            line.leave_out(
-                Choice::Specular,
-                format!("no {missing} beside the video, so the camera is looked for in the picture alone"),
-            );
+            line.stages.push(Box::new(Waiting(POSE_REFINEMENT)));
+            line.stages
+                .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
         }
     }
-    line.stages.push(Box::new(PoseRefinement::new(
+    Ok(())
+}
+
+/// Names of the stages whose places are kept while a light field is on its way.
+const POSE_STAMPING: &str = "pose";
+const POSE_REFINEMENT: &str = "pose_refinement";
+
+/// The stages that need a light field, in the order of the line.
+pub fn light_field_stages(
+    config: &Config,
+    equipment: &Equipment<'_>,
+    light_field: &Arc<LightField>,
+) -> Result<Vec<Box<dyn Stage>>, ComposeError> {
+    let mut stages: Vec<Box<dyn Stage>> = Vec::new();
+    let recorded = || equipment.recording.trajectory.as_ref();
+    let poses = match &equipment.poses {
+        Some(poses) => Some(poses.clone()),
+        None => recorded()
+            .map(|trajectory| PoseBuffer::from_trajectory(trajectory, &config.poses).map(Poses::Recorded))
+            .transpose()?,
+    };
+    if let (Some(poses), Some(hand_eye)) = (poses, &equipment.recording.hand_eye) {
+        let mut stamping = PoseStamping::new(poses, hand_eye.clone());
+        if hand_eye.time_offset.is_none() && light_field.time_offset != Span(0) {
+            stamping = stamping.with_time_offset(light_field.time_offset);
+        }
+        stages.push(Box::new(stamping));
+    }
+    stages.push(Box::new(PoseRefinement::new(
         &config.pose_refinement,
         Arc::clone(light_field),
     )));
-    line.stages.push(Box::new(SpecularitySubstitution::new(
+    stages.push(Box::new(SpecularitySubstitution::new(
         &config.substitution,
         Some(Arc::clone(light_field)),
     )));
-    Ok(())
+    Ok(stages)
+}
+
+/// The names of the stages of a line that only keep a place.
+pub fn waiting_stages() -> [&'static str; 2] {
+    [POSE_STAMPING, POSE_REFINEMENT]
 }

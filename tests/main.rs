@@ -21,6 +21,7 @@ mod feed_fuzz;
 mod hand_eye;
 mod import;
 mod light_field;
+mod live;
 mod live_line;
 mod media;
 mod oblique;

@@ -128,6 +128,8 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     let equipment = Equipment {
         recording: &recording,
         light_field,
+        light_field_to_come: false,
+        poses: None,
         size: (info.width, info.height),
     };
     let Line {
