@@ -272,7 +272,7 @@ mod tests {
     fn frame(number: u64, width: usize) -> Arc<Frame> {
         let at = Timestamp(1_000_000_000_000 + number as i64 * 40_000_000);
         let mut image = Pool::new(1).take(width, 48);
-        image.fill([10 + 8 * number as u8; 3]);
+        image.fill([10 + 8 * (number % 30) as u8; 3]);
         Arc::new(Frame::new(FrameId(number), at, at, image))
     }
 

@@ -1,5 +1,7 @@
 //! A camera's bytes as a picture.
 
+use std::sync::OnceLock;
+
 use image::{DynamicImage, ImageFormat};
 use yuv::{YuvBiPlanarImage, YuvConversionMode, YuvPackedImage, YuvRange, YuvStandardMatrix};
 
@@ -98,7 +100,7 @@ pub fn rgb_from_bytes(bytes: &[u8], mode: &Mode, out: &mut Image<Rgb8>) -> Resul
             yuv::yuv_nv12_to_rgb(&planes, out.as_bytes_mut(), 3 * w, range, matrix, YuvConversionMode::Balanced).map_err(refused)
         }
         Layout::Mjpeg => {
-            let decoded = image::load_from_memory_with_format(bytes, ImageFormat::Jpeg)
+            let decoded = image::load_from_memory_with_format(&with_huffman_tables(bytes), ImageFormat::Jpeg)
                 .map_err(|error| PixelError::Jpeg(format!("expected a JPEG picture: {error}")))?;
             if (decoded.width(), decoded.height()) != (w, h) {
                 let found = format!("{}x{}", decoded.width(), decoded.height());
@@ -124,6 +126,48 @@ fn with_whole_rows(bytes: &[u8], stride: usize, rows: usize) -> std::borrow::Cow
             padded.into()
         }
     }
+}
+
+/// Markers of a JPEG file (ITU-T T.81, table B.1).
+const MARKER: u8 = 0xff;
+const DEFINES_HUFFMAN_TABLES: u8 = 0xc4;
+const STARTS_SCAN: u8 = 0xda;
+
+/// The segments of a JPEG file before its first scan, from marker to marker.
+fn segments(bytes: &[u8]) -> impl Iterator<Item = &[u8]> {
+    let mut rest = bytes.get(2..).unwrap_or(&[]);
+    std::iter::from_fn(move || {
+        let &[MARKER, kind, high, low, ..] = rest else { return None };
+        if kind == STARTS_SCAN {
+            return None;
+        }
+        let length = 2 + usize::from(u16::from_be_bytes([high, low]));
+        let (segment, behind) = rest.split_at_checked(length)?;
+        rest = behind;
+        Some(segment)
+    })
+}
+
+fn defines_tables(segment: &&[u8]) -> bool {
+    segment.get(1) == Some(&DEFINES_HUFFMAN_TABLES)
+}
+
+/// A file that many cameras send without its Huffman tables, with those that are meant then: the ones of ITU-T T.81, annex K.3, which
+/// the encoder of the crate `image` uses.
+fn with_huffman_tables(bytes: &[u8]) -> std::borrow::Cow<'_, [u8]> {
+    static TABLES: OnceLock<Vec<u8>> = OnceLock::new();
+    if bytes.len() < 4 || segments(bytes).any(|segment| defines_tables(&segment)) {
+        return bytes.into();
+    }
+    let tables = TABLES.get_or_init(|| {
+        let mut file = std::io::Cursor::new(Vec::new());
+        match DynamicImage::new_rgb8(8, 8).write_to(&mut file, ImageFormat::Jpeg) {
+            Ok(()) => segments(file.get_ref()).filter(defines_tables).flatten().copied().collect(),
+            Err(_) => Vec::new(),
+        }
+    });
+    let (start, rest) = bytes.split_at(2);
+    [start, tables, rest].concat().into()
 }
 
 #[cfg(test)]
