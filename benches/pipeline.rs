@@ -71,6 +71,9 @@ fn line(operation: &Operation, front: Front) -> Line {
     let equipment = Equipment {
         recording: &operation.recording,
         light_field: Some(Arc::clone(&operation.light_field)),
+        light_field_to_come: false,
+        may_wait: false,
+        poses: None,
         size: operation.size,
     };
     let mut line = compose::line(&config, &Choice::ALL, &equipment).expect("the default line stands");

@@ -17,12 +17,13 @@ use crate::robot::pose_buffer::{self, PoseBuffer};
 use crate::stages::color_normalization::color_file::ColorFile;
 use crate::stages::color_normalization::stage::ColorNormalization;
 use crate::stages::pose_refinement::{PoseRefinement, Reference};
-use crate::stages::pose_stamping::PoseStamping;
+use crate::stages::pose_stamping::{PoseStamping, Poses};
 use crate::stages::rolling_light_field::{Maker, RollingLightField};
 use crate::stages::specularity_detection::SpecularityDetection;
 use crate::stages::specularity_substitution::stage::{SpecularitySubstitution, Witnesses};
 use crate::stages::temporal_median::stage::TemporalMedian;
 use crate::stages::undistortion::{self, Undistortion};
+use crate::stages::waiting::Waiting;
 use crate::stages::{color_normalization, temporal_median};
 use crate::time::Span;
 
@@ -78,6 +79,12 @@ pub struct Equipment<'a> {
     pub recording: &'a Recording,
     /// What other views saw.
     pub light_field: Option<Arc<LightField>>,
+    /// True when a light field is still on its way: its stages have their places in the line, for [`light_field_stages`] to take.
+    pub light_field_to_come: bool,
+    /// Whether the line may wait for work on a frame, as on a recording: then a light field can be made of its own last frames.
+    pub may_wait: bool,
+    /// The arm's poses, where they are not the recording's as they stand there.
+    pub poses: Option<Poses>,
     /// Size of the pictures, px.
     pub size: (usize, usize),
 }
@@ -172,9 +179,10 @@ pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Re
 fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line: &mut Line) -> Result<(), ComposeError> {
     let recording = equipment.recording;
     let only_marked = "specularities are only found and marked 64 in the mask";
-    let rolls = config.rolling.enabled && recording.trajectory.is_some() && recording.hand_eye.is_some();
-    let lacking = if equipment.light_field.is_none() && !rolls {
-        Some(if config.rolling.enabled {
+    let has_poses = equipment.poses.is_some() || recording.trajectory.is_some();
+    let rolls = config.rolling.enabled && equipment.may_wait && has_poses && recording.hand_eye.is_some();
+    let lacking = if equipment.light_field.is_none() && !equipment.light_field_to_come && !rolls {
+        Some(if config.rolling.enabled && equipment.may_wait {
             "no light field (--light-field LF), nor poses and hand_eye.yaml to make one of the video's own frames"
         } else {
             "no light field (--light-field LF)"
@@ -193,43 +201,78 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
             .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
         return Ok(());
     }
-    let light_field = equipment.light_field.as_ref();
-    match (&recording.trajectory, &recording.hand_eye) {
-        (Some(trajectory), Some(hand_eye)) => {
-            let poses = PoseBuffer::from_trajectory(trajectory, &config.poses)?;
-            let mut stamping = PoseStamping::new(poses, hand_eye.clone());
-            let of_survey = light_field.map_or(Span(0), |light_field| light_field.time_offset);
-            if hand_eye.time_offset.is_none() && of_survey != Span(0) {
-                stamping = stamping.with_time_offset(of_survey);
-            }
-            line.stages.push(Box::new(stamping));
-        }
-        (trajectory, _) => {
-            let missing = if trajectory.is_none() { "poses.tum" } else { "hand_eye.yaml" };
-            line.leave_out(
-                Choice::Specular,
-                format!("no {missing} beside the video, so the camera is looked for in the picture alone"),
-            );
-        }
+    if !has_poses || recording.hand_eye.is_none() {
+        let missing = if has_poses { "hand_eye.yaml" } else { "poses.tum" };
+        line.leave_out(
+            Choice::Specular,
+            format!("no {missing} beside the video, so the camera is looked for in the picture alone"),
+        );
     }
-    match light_field {
-        Some(light_field) => {
-            line.stages.push(Box::new(PoseRefinement::new(
-                &config.pose_refinement,
-                Arc::clone(light_field),
-            )));
-            line.stages.push(Box::new(SpecularitySubstitution::new(
-                &config.substitution,
-                Some(Arc::clone(light_field)),
-            )));
+    match &equipment.light_field {
+        Some(light_field) => line.stages.extend(light_field_stages(config, equipment, light_field)?),
+        None if rolls => rolling(config, equipment, line)?,
+        None => {
+            if has_poses && recording.hand_eye.is_some() {
+                line.stages.push(Box::new(Waiting(POSE_STAMPING)));
+            }
+            line.stages.push(Box::new(Waiting(POSE_REFINEMENT)));
+            line.stages
+                .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
         }
-        None => rolling(config, line),
     }
     Ok(())
 }
 
+/// Names of the stages whose places are kept while a light field is on its way.
+const POSE_STAMPING: &str = "pose";
+const POSE_REFINEMENT: &str = "pose_refinement";
+
+/// The names of the stages of a line that only keep a place.
+pub fn waiting_stages() -> [&'static str; 2] {
+    [POSE_STAMPING, POSE_REFINEMENT]
+}
+
+/// The stages that need a light field, in the order of the line.
+pub fn light_field_stages(
+    config: &Config,
+    equipment: &Equipment<'_>,
+    light_field: &Arc<LightField>,
+) -> Result<Vec<Box<dyn Stage>>, ComposeError> {
+    let mut stages: Vec<Box<dyn Stage>> = Vec::new();
+    stages.extend(stamping(config, equipment, light_field.time_offset)?);
+    stages.push(Box::new(PoseRefinement::new(
+        &config.pose_refinement,
+        Arc::clone(light_field),
+    )));
+    stages.push(Box::new(SpecularitySubstitution::new(
+        &config.substitution,
+        Some(Arc::clone(light_field)),
+    )));
+    Ok(stages)
+}
+
+/// The stage that knows the arm's poses; `of_survey` is the time offset where the hand-eye file tells none.
+fn stamping(config: &Config, equipment: &Equipment<'_>, of_survey: Span) -> Result<Option<Box<dyn Stage>>, ComposeError> {
+    let recorded = || equipment.recording.trajectory.as_ref();
+    let poses = match &equipment.poses {
+        Some(poses) => Some(poses.clone()),
+        None => recorded()
+            .map(|trajectory| PoseBuffer::from_trajectory(trajectory, &config.poses).map(Poses::Recorded))
+            .transpose()?,
+    };
+    let (Some(poses), Some(hand_eye)) = (poses, &equipment.recording.hand_eye) else {
+        return Ok(None);
+    };
+    let mut stamping = PoseStamping::new(poses, hand_eye.clone());
+    if hand_eye.time_offset.is_none() && of_survey != Span(0) {
+        stamping = stamping.with_time_offset(of_survey);
+    }
+    Ok(Some(Box::new(stamping)))
+}
+
 /// The stages that make a light field of the video's own last frames, and use it.
-fn rolling(config: &Config, line: &mut Line) {
+fn rolling(config: &Config, equipment: &Equipment<'_>, line: &mut Line) -> Result<(), ComposeError> {
+    line.stages.extend(stamping(config, equipment, Span(0))?);
     let (reference, witnesses) = (Slot::new(), Slot::new());
     let maker = made_at_once(config, reference.clone(), witnesses.clone());
     line.stages.push(Box::new(RollingLightField::new(&config.rolling, maker)));
@@ -237,6 +280,7 @@ fn rolling(config: &Config, line: &mut Line) {
         .push(Box::new(PoseRefinement::awaiting(&config.pose_refinement, reference)));
     line.stages
         .push(Box::new(SpecularitySubstitution::awaiting(&config.substitution, witnesses)));
+    Ok(())
 }
 
 /// Makes each light field before the frame that called for it goes on: on a recording nothing hurries, and every run is alike.

@@ -12,8 +12,10 @@ use toml::{Table, Value};
 use crate::image::{field_of_view, specularity};
 use crate::light_field::prior::PriorSettings;
 use crate::light_field::rolling;
+use crate::pipeline::live;
 use crate::robot::feed;
 use crate::robot::pose_buffer::{self, PoseBuffer};
+use crate::sources::camera::settings as camera;
 use crate::stages::{color_normalization, pose_refinement, specularity_substitution, temporal_median, undistortion};
 
 /// One `key=value` of `--set`.
@@ -124,6 +126,10 @@ pub struct Config {
     pub line: LineSettings,
     /// How videos are written.
     pub output: OutputSettings,
+    /// How long a live picture may take.
+    pub live: live::Settings,
+    /// The camera of a live line.
+    pub camera: camera::Settings,
     /// The temporal color median.
     pub median: temporal_median::settings::Settings,
     /// Color normalization.
@@ -211,6 +217,8 @@ impl Config {
         within("line.frames_between_stages", self.line.frames_between_stages, 1, 64)?;
         within("line.frames_before_sinks", self.line.frames_before_sinks, 1, 256)?;
         within("output.crf", usize::from(self.output.crf), 0, 51)?;
+        self.live.check()?;
+        self.camera.check()?;
         self.median.check().map_err(|error| error.to_string())?;
         self.color.check().map_err(|error| error.to_string())?;
         if let Some(balance) = self.undistort.balance.filter(|balance| !(0.0..=1.0).contains(balance)) {

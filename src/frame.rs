@@ -136,6 +136,8 @@ pub struct Frame {
     pub analysis: Option<Analysis>,
     /// What was replaced, and by what.
     pub provenance: Option<Provenance>,
+    /// True for a copy that left before the first stage: for taps, and live for whoever waits when the line is late.
+    pub untouched: bool,
     /// Where the frame spent its time.
     pub timings: Vec<StageTiming>,
 }
@@ -160,6 +162,7 @@ impl Frame {
             alignment: None,
             analysis: None,
             provenance: None,
+            untouched: false,
             timings: Vec::with_capacity(12),
         }
     }

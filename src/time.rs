@@ -91,6 +91,12 @@ impl Clock for MonotonicClock {
     }
 }
 
+/// Processor time that all threads of this process have used so far.
+pub fn process_time() -> Timestamp {
+    let time = rustix::time::clock_gettime(rustix::time::ClockId::ProcessCPUTime);
+    Timestamp(time.tv_sec * 1_000_000_000 + time.tv_nsec)
+}
+
 /// A clock that a test turns by hand.
 #[derive(Debug, Default)]
 pub struct ManualClock(AtomicI64);

@@ -85,6 +85,9 @@ fn allocations() -> Vec<String> {
     let equipment = Equipment {
         recording: &recording,
         light_field: None,
+        light_field_to_come: false,
+        may_wait: false,
+        poses: None,
         size: SIZE,
     };
     let mut config = Config::default();

@@ -22,6 +22,9 @@ fn run_once() -> Seen {
     let equipment = Equipment {
         recording: &recording,
         light_field: None,
+        light_field_to_come: false,
+        may_wait: false,
+        poses: None,
         size: (width, height),
     };
     let mut config = Config::default();

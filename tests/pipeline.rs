@@ -225,8 +225,8 @@ fn whoever_waits_may_wish_for_the_end() {
         .unwrap();
     permit.send(()).unwrap();
     let mut permit = Some(permit);
-    let outcome = running.wait_looking(|status| {
-        assert!(status.frames_in <= 1);
+    let outcome = running.wait_looking(|line| {
+        assert!(line.status().frames_in <= 1);
         drop(permit.take());
         Wish::Stop
     });

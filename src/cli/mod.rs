@@ -1,6 +1,7 @@
 //! The commands; the only place that prints.
 
 pub mod arm;
+pub mod bench;
 pub mod calibrate;
 pub mod console;
 pub mod context;
@@ -8,6 +9,7 @@ pub mod demo;
 pub mod import;
 pub mod import_sequence;
 pub mod light_field;
+pub mod live;
 pub mod measure;
 pub mod outputs;
 pub mod process;
@@ -52,10 +54,12 @@ enum Command {
     Calibrate(calibrate::Args),
     Demo(demo::Args),
     Process(process::Args),
+    Live(live::run::Args),
     LightField(light_field::Args),
     Simulate(simulate::Args),
     Import(import_sequence::Args),
     Arm(arm::Args),
+    Bench(bench::run::Args),
 }
 
 /// Run the command line; its outcome as the process's exit code.
@@ -119,12 +123,14 @@ fn run(command: Command, context: &Context) -> anyhow::Result<Ended> {
         Command::Calibrate(args) => calibrate::run(&args, context),
         Command::Demo(args) => demo::run(&args, context),
         Command::Process(args) => process::run(&args, context),
+        Command::Live(args) => live::run::run(&args, context),
         Command::LightField(args) => {
             light_field::run(&args, &context.config, context.force, &context.console).map(|()| Ended::Complete)
         }
         Command::Simulate(args) => simulate::run(args, context),
         Command::Import(args) => import_sequence::run(&args, context),
         Command::Arm(args) => arm::run(&args, context),
+        Command::Bench(args) => bench::run::run(&args, context),
     }
 }
 

@@ -128,6 +128,9 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
     let equipment = Equipment {
         recording: &recording,
         light_field,
+        light_field_to_come: false,
+        may_wait: true,
+        poses: None,
         size: (info.width, info.height),
     };
     let Line {
@@ -206,7 +209,8 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
         span.frames(info.frame_count, info.duration_s, info.frames_per_second()),
     );
     let mut shown = 0;
-    let outcome = running.wait_looking(|status| {
+    let outcome = running.wait_looking(|line| {
+        let status = line.status();
         context.console.advance(status.frames_out - shown);
         shown = status.frames_out;
         if context.console.stopping() { Wish::Stop } else { Wish::GoOn }

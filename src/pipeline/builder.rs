@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
+use crate::pipeline::live::Limits;
 use crate::pipeline::queue::{Overflow, Queue};
 use crate::pipeline::stage::{Sink, Source, Stage};
 use crate::time::Clock;
@@ -25,6 +26,9 @@ pub enum BuildError {
     /// A queue that holds nothing.
     #[error("expected room for at least 1 frame in the queue of `{0}`, found 0")]
     NoRoom(&'static str),
+    /// A live line must not wait for anybody.
+    #[error("expected every queue into and out of a live line to drop its oldest, found one that waits at `{0}`")]
+    Waits(&'static str),
 }
 
 pub(super) struct Door {
@@ -40,6 +44,7 @@ pub struct Builder {
     entry: Queue,
     between: usize,
     keep_original: bool,
+    limits: Option<Limits>,
     stages: Vec<Box<dyn Stage>>,
     taps: Vec<Door>,
     sinks: Vec<Door>,
@@ -52,6 +57,7 @@ pub struct Pipeline {
     pub(super) entry: Queue,
     pub(super) between: usize,
     pub(super) keep_original: bool,
+    pub(super) limits: Option<Limits>,
     pub(super) stages: Vec<Box<dyn Stage>>,
     pub(super) taps: Vec<Door>,
     pub(super) sinks: Vec<Door>,
@@ -84,6 +90,7 @@ impl Pipeline {
             entry: Queue::blocking(BETWEEN_STAGES),
             between: BETWEEN_STAGES,
             keep_original: false,
+            limits: None,
             stages: Vec::new(),
             taps: Vec::new(),
             sinks: Vec::new(),
@@ -110,6 +117,13 @@ impl Builder {
     #[must_use]
     pub fn keep_original(mut self, keep: bool) -> Self {
         self.keep_original = keep;
+        self
+    }
+
+    /// A live line: no frame waits longer than `limits` say. Every queue at its doors must drop its oldest.
+    #[must_use]
+    pub fn live(mut self, limits: Limits) -> Self {
+        self.limits = Some(limits);
         self
     }
 
@@ -176,6 +190,15 @@ impl Builder {
         if let Some(door) = doors().find(|door| door.queue.capacity == 0) {
             return Err(BuildError::NoRoom(door.sink.name()));
         }
+        if self.limits.is_some() {
+            let waits = |queue: Queue| queue.overflow == Overflow::Block;
+            if let Some(door) = doors().find(|door| waits(door.queue)) {
+                return Err(BuildError::Waits(door.sink.name()));
+            }
+            if waits(self.entry) {
+                return Err(BuildError::Waits("source"));
+            }
+        }
         if self.entry.capacity == 0 || self.between == 0 {
             return Err(BuildError::NoRoom("stages"));
         }
@@ -185,6 +208,7 @@ impl Builder {
             entry: self.entry,
             between: self.between,
             keep_original: self.keep_original,
+            limits: self.limits,
             stages: self.stages,
             taps: self.taps,
             sinks: self.sinks,

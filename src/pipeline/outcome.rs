@@ -1,5 +1,6 @@
 //! What came of a line that has ended: counts, times, and everything that went wrong.
 
+use crate::pipeline::ledger::Passed;
 use crate::pipeline::timing::Durations;
 
 /// What came of one stage.
@@ -17,6 +18,14 @@ pub struct StageOutcome {
     pub first_failure: Option<String>,
     /// Frames that passed while it was switched off.
     pub switched_off: u64,
+    /// Live: frames that passed because there was no time for it.
+    pub skipped: u64,
+    /// Live: frames whose untouched picture went out while they were here.
+    pub overdue: u64,
+    /// Live: times it was switched off for a while because it overran often.
+    pub rests: u64,
+    /// Live: times it did not return from a frame for too long.
+    pub hangs: u64,
     /// The panic's message, if it panicked; from then on it was passed by.
     pub panic: Option<String>,
 }
@@ -47,6 +56,8 @@ pub struct Outcome {
     pub frames_out: u64,
     /// Frames dropped between source and first stage.
     pub frames_dropped: u64,
+    /// What came out of a live line, and how.
+    pub passed: Passed,
     /// Time the source took for a frame.
     pub source_working: Durations,
     /// From arrival to the end of the line, before the sinks.

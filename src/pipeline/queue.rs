@@ -6,7 +6,9 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use crossbeam::channel::{self, TrySendError};
+use std::time::Duration;
+
+use crossbeam::channel::{self, SendTimeoutError, TrySendError};
 
 /// What happens when a queue is full.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -92,6 +94,18 @@ impl DropCount {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Closed;
 
+/// How often a sender that waits asks whether it still shall.
+const ASK_EVERY: Duration = Duration::from_millis(1);
+
+/// Why an item was not taken; it comes back.
+#[derive(Debug)]
+pub enum Refused<T> {
+    /// Nobody takes from this queue any more.
+    Closed,
+    /// The sender no longer wanted to wait.
+    GivenUp(T),
+}
+
 /// The end where items go in.
 #[derive(Debug)]
 pub struct Sender<T> {
@@ -100,7 +114,33 @@ pub struct Sender<T> {
     shared: Arc<Shared>,
 }
 
+impl<T> Clone for Sender<T> {
+    fn clone(&self) -> Self {
+        Self {
+            channel: self.channel.clone(),
+            oldest: self.oldest.clone(),
+            shared: Arc::clone(&self.shared),
+        }
+    }
+}
+
 impl<T> Sender<T> {
+    /// Put an item in; while the queue is full and would block, ask every millisecond whether to give up.
+    pub fn push_unless(&self, item: T, given_up: impl Fn() -> bool) -> Result<(), Refused<T>> {
+        if self.oldest.is_some() {
+            return self.push(item).map_err(|Closed| Refused::Closed);
+        }
+        let mut item = item;
+        loop {
+            item = match self.channel.send_timeout(item, ASK_EVERY) {
+                Ok(()) => return Ok(()),
+                Err(SendTimeoutError::Disconnected(_)) => return Err(Refused::Closed),
+                Err(SendTimeoutError::Timeout(item)) if given_up() => return Err(Refused::GivenUp(item)),
+                Err(SendTimeoutError::Timeout(item)) => item,
+            };
+        }
+    }
+
     /// Put an item in; waits or drops the oldest when the queue is full.
     pub fn push(&self, item: T) -> Result<(), Closed> {
         let Some(oldest) = &self.oldest else {
@@ -141,6 +181,11 @@ impl<T> Receiver<T> {
     pub fn pop(&self) -> Option<T> {
         self.channel.recv().ok()
     }
+
+    /// The longest waiting item, if any waits.
+    pub fn try_pop(&self) -> Option<T> {
+        self.channel.try_recv().ok()
+    }
 }
 
 impl<T> Drop for Receiver<T> {
@@ -178,6 +223,16 @@ mod tests {
             drop(receiver);
             assert_eq!(sender.push(1), Err(Closed));
         }
+    }
+
+    #[test]
+    fn a_sender_that_waits_may_give_up() {
+        let (sender, receiver) = Queue::blocking(1).open();
+        sender.push_unless(1, || true).unwrap();
+        assert!(matches!(sender.push_unless(2, || true), Err(Refused::GivenUp(2))));
+        assert_eq!(receiver.try_pop(), Some(1));
+        drop(receiver);
+        assert!(matches!(sender.push_unless(3, || false), Err(Refused::Closed)));
     }
 
     #[test]

@@ -23,6 +23,11 @@ pub struct SinkError(pub String);
 pub trait Source: Send {
     /// The next frame; `None` at the end.
     fn next_frame(&mut self) -> Result<Option<Frame>, SourceError>;
+    /// True when [`Frame::arrived_at`] is the instant at which this process was given the frame's bytes, which is earlier than
+    /// when a picture was made of them.
+    fn stamps_arrivals(&self) -> bool {
+        false
+    }
 }
 
 /// What happens to a frame. A stage works on its own buffer and swaps the result in as its last act.

@@ -62,6 +62,58 @@ impl Durations {
     }
 }
 
+/// The last few durations: how it goes right now.
+#[derive(Clone, Debug)]
+pub struct RecentDurations {
+    ring: [i64; Self::CAPACITY],
+    count: usize,
+    next: usize,
+}
+
+impl Default for RecentDurations {
+    fn default() -> Self {
+        Self {
+            ring: [0; Self::CAPACITY],
+            count: 0,
+            next: 0,
+        }
+    }
+}
+
+impl RecentDurations {
+    /// Eight seconds at 30 frames a second.
+    const CAPACITY: usize = 256;
+
+    /// Count one more; the oldest is forgotten.
+    pub fn record(&mut self, span: Span) {
+        if let Some(slot) = self.ring.get_mut(self.next) {
+            *slot = span.0.max(0);
+        }
+        self.next = (self.next + 1) % Self::CAPACITY;
+        self.count = (self.count + 1).min(Self::CAPACITY);
+    }
+
+    /// Count, percentiles and maximum.
+    pub fn summary(&self) -> Summary {
+        let mut sorted: Vec<i64> = self.ring.iter().take(self.count).copied().collect();
+        sorted.sort_unstable();
+        // The smallest that so many do not exceed, as the histogram has it.
+        let at = |share: f64| {
+            let rank = (share * sorted.len() as f64).ceil().max(1.0) as usize;
+            let ns = sorted.get(rank - 1).or(sorted.last()).copied().unwrap_or(0);
+            ms_from_ns(ns.unsigned_abs())
+        };
+        Summary {
+            count: self.count as u64,
+            p50_ms: at(0.5),
+            p95_ms: at(0.95),
+            p99_ms: at(0.99),
+            p999_ms: at(0.999),
+            max_ms: at(1.0),
+        }
+    }
+}
+
 /// To a microsecond: the histogram knows no finer.
 fn ms_from_ns(ns: u64) -> f64 {
     (ns as f64 * 1e-3).round() * 1e-3
@@ -105,6 +157,19 @@ mod tests {
             assert!((found - expected).abs() <= 1e-3 * expected, "{summary:?}");
         }
         assert_eq!(summary.count, 100);
+    }
+
+    #[test]
+    fn the_recent_forget_the_past() {
+        let mut recent = RecentDurations::default();
+        assert_eq!(recent.summary(), Summary::default());
+        (0..1000).for_each(|_| recent.record(Span::from_milliseconds(500.0)));
+        (1..=256).for_each(|n| recent.record(Span::from_milliseconds(f64::from(n))));
+        let summary = recent.summary();
+        assert_eq!(
+            (summary.count, summary.p50_ms, summary.p99_ms, summary.max_ms),
+            (256, 128.0, 254.0, 256.0)
+        );
     }
 
     #[test]

@@ -1,3 +1,5 @@
 //! Where frames come from.
 
+pub mod camera;
 pub mod recording;
+pub mod synthetic;

@@ -7,14 +7,54 @@ use crate::frame::{Frame, PoseOrigin};
 use crate::geometry::space::{RobotBase, World};
 use crate::geometry::transform::Transform;
 use crate::pipeline::stage::{Stage, StageError};
+use crate::robot::feed::reader::SharedPoses;
 use crate::robot::hand_eye::HandEye;
-use crate::robot::pose_buffer::{Origin, PoseBuffer};
-use crate::time::Span;
+use crate::robot::pose_buffer::{Origin, PoseBuffer, PoseLookupError, StampedPose};
+use crate::time::{Span, Timestamp};
+
+/// Where the arm's poses are.
+#[derive(Clone, Debug)]
+pub enum Poses {
+    /// All of them, from a recording.
+    Recorded(PoseBuffer),
+    /// Those of the last seconds, from an arm.
+    Live(SharedPoses),
+    /// A recording's that is played again and again.
+    Repeated {
+        /// On the recording's clock.
+        buffer: PoseBuffer,
+        /// The recording's first picture, on its own clock.
+        first: Timestamp,
+        /// When that picture was first played, on the host's clock.
+        began: Timestamp,
+        /// From one turn to the next.
+        length: Span,
+    },
+}
+
+impl Poses {
+    /// Where the hand was when a picture was exposed, if `time_offset` must be added to a pose stamp to get the camera's clock.
+    fn pose_at(&self, exposed_at: Timestamp, time_offset: Span) -> Result<StampedPose, PoseLookupError> {
+        match self {
+            Self::Recorded(buffer) => buffer.pose_at(exposed_at - time_offset),
+            Self::Live(poses) => poses.pose_at(exposed_at - time_offset),
+            Self::Repeated {
+                buffer,
+                first,
+                began,
+                length,
+            } => {
+                let within = (exposed_at - *began).0.rem_euclid(length.0.max(1));
+                buffer.pose_at(*first + Span(within) - time_offset)
+            }
+        }
+    }
+}
 
 /// Stamps frames with poses; a frame without one is marked, not held up.
 #[derive(Debug)]
 pub struct PoseStamping {
-    poses: PoseBuffer,
+    poses: Poses,
     hand_eye: HandEye,
     time_offset: Span,
     world_from_base: Transform<World, RobotBase>,
@@ -22,7 +62,7 @@ pub struct PoseStamping {
 
 impl PoseStamping {
     /// With the time offset of the hand-eye file, or none.
-    pub fn new(poses: PoseBuffer, hand_eye: HandEye) -> Self {
+    pub fn new(poses: Poses, hand_eye: HandEye) -> Self {
         let time_offset = hand_eye.time_offset.unwrap_or_default();
         Self {
             poses,
@@ -45,7 +85,7 @@ impl Stage for PoseStamping {
     }
 
     fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
-        let Ok(pose) = self.poses.pose_at(frame.exposed_at - self.time_offset) else {
+        let Ok(pose) = self.poses.pose_at(frame.exposed_at, self.time_offset) else {
             frame.world_from_camera = None;
             frame.pose_origin = PoseOrigin::Missing;
             frame.camera_speed = None;
@@ -97,7 +137,9 @@ mod tests {
         hand_eye.time_offset = Some(Span::from_milliseconds(offset_ms));
         let at = Timestamp::from_seconds(at_s);
         let mut frame = Frame::new(FrameId(0), at, at, Pool::new(1).take(2, 2));
-        PoseStamping::new(buffer, hand_eye).process(&mut frame).unwrap();
+        PoseStamping::new(Poses::Recorded(buffer), hand_eye)
+            .process(&mut frame)
+            .unwrap();
         frame
     }
 
@@ -118,6 +160,30 @@ mod tests {
         let velocity = Vector3::new(10.0, 0.0, 0.0) + 0.5 * 300.0 * Vector3::new(-(0.5_f64).sin(), (0.5_f64).cos(), 0.0);
         assert!((linear - velocity.norm()).abs() < 1e-4, "{linear}");
         assert!((angular - 0.5).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_recording_that_is_played_again_repeats_its_poses() {
+        let poses = (0..100).map(|i| {
+            let t = 5.0 + 0.02 * f64::from(i);
+            TimedPose {
+                stamp: Timestamp::from_seconds(t),
+                base_from_hand: hand_at(t),
+            }
+        });
+        let trajectory = Trajectory::new(poses.collect()).unwrap();
+        let poses = Poses::Repeated {
+            buffer: PoseBuffer::from_trajectory(&trajectory, &Settings::default()).unwrap(),
+            first: Timestamp::from_seconds(5.2),
+            began: Timestamp::from_seconds(1000.0),
+            length: Span::from_seconds(1.5),
+        };
+        for turn in [0.0, 1.0, 7.0] {
+            let at = Timestamp::from_seconds(1000.0 + 1.5 * turn + 0.8);
+            let pose = poses.pose_at(at, Span::from_milliseconds(-100.0)).unwrap();
+            let truth = hand_at(5.2 + 0.8 + 0.1);
+            assert!((pose.base_from_hand.translation() - truth.translation()).norm() < 1e-6);
+        }
     }
 
     #[test]

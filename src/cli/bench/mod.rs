@@ -1,0 +1,5 @@
+//! `bench`: how long a frame takes through the line, and how many a second it can.
+
+pub mod plot;
+pub mod report;
+pub mod run;

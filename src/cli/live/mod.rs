@@ -1,0 +1,6 @@
+//! `live`: the line on camera and arm, while they run.
+
+pub mod run;
+pub mod session;
+pub mod source;
+pub mod status;
