@@ -7,7 +7,6 @@ use std::sync::Arc;
 
 use crate::camera::model::CameraModel;
 use crate::config::Config;
-use crate::light_field::build::BuildSettings;
 use crate::light_field::view::LightField;
 use crate::pipeline::slot::Slot;
 use crate::pipeline::stage::Stage;
@@ -285,21 +284,19 @@ fn rolling(config: &Config, equipment: &Equipment<'_>, line: &mut Line) -> Resul
 
 /// Makes each light field before the frame that called for it goes on: on a recording nothing hurries, and every run is alike.
 fn made_at_once(config: &Config, reference: Slot<Reference>, witnesses: Slot<Witnesses>) -> Maker {
-    let (trust, alignment) = (config.survey.clone(), config.pose_refinement.clone());
+    let (trust, settings, alignment) = (config.survey.clone(), config.rolling.clone(), config.pose_refinement.clone());
     let mut told = false;
-    Box::new(
-        move |batch, camera| match batch.built(camera, &trust, &BuildSettings::default(), &Silent) {
-            Ok(light_field) => {
-                tracing::debug!("a light field of {} of the last frames", light_field.views.len());
-                let light_field = Arc::new(light_field);
-                reference.put(Reference::new(Arc::clone(&light_field), &alignment));
-                witnesses.put(Witnesses::new(light_field));
-            }
-            Err(error) if !told => {
-                told = true;
-                tracing::warn!("specular: no light field could be made of the last frames, a later one may: {error}");
-            }
-            Err(_) => {}
-        },
-    )
+    Box::new(move |batch, camera| match batch.built(camera, &trust, &settings, &Silent) {
+        Ok(light_field) => {
+            tracing::debug!("a light field of {} of the last frames", light_field.views.len());
+            let light_field = Arc::new(light_field);
+            reference.put(Reference::new(Arc::clone(&light_field), &alignment));
+            witnesses.put(Witnesses::new(light_field));
+        }
+        Err(error) if !told => {
+            told = true;
+            tracing::warn!("specular: no light field could be made of the last frames, a later one may: {error}");
+        }
+        Err(_) => {}
+    })
 }

@@ -28,6 +28,7 @@ mod oblique;
 mod pipeline;
 mod recording;
 mod robot;
+mod rolling;
 mod support;
 mod survey;
 mod synthetic;
