@@ -25,6 +25,11 @@ const GREY_SINE: f32 = 0.1;
 
 const CHANGED: u8 = 255;
 
+/// From this level on a channel may be clipped, and the change's colour says nothing.
+const CLIPPED_LEVEL: f32 = 245.0;
+/// Patches that are all but clipped throughout are the lamp's whatever their colour: share of the weight that is not clipped.
+const LEAST_COLORED_SHARE: f32 = 0.02;
+
 /// Sums over a patch, each pixel weighed by the luma that it loses.
 #[derive(Clone, Copy, Debug, Default)]
 struct Change {
@@ -32,9 +37,11 @@ struct Change {
     weight: f32,
     /// Of the loss in luma.
     loss: f32,
-    /// Of the loss in colour.
+    /// Of pixels that are not clipped.
+    colored: f32,
+    /// Of their loss in colour.
     color: [f32; 3],
-    /// Of the new colour.
+    /// Of their new colour.
     tissue: [f32; 3],
 }
 
@@ -45,6 +52,10 @@ impl Change {
         self.pixels += 1.0;
         self.weight += weight;
         self.loss += weight * weight;
+        if old.iter().any(|&level| level >= CLIPPED_LEVEL) {
+            return;
+        }
+        self.colored += weight;
         for c in 0..3 {
             self.color[c] += weight * lost[c];
             self.tissue[c] += weight * new[c];
@@ -54,14 +65,13 @@ impl Change {
     /// Whether the lamp explains it.
     fn is_the_lamps(&self) -> bool {
         let weight = self.weight.max(1e-6);
-        let (loss, color, tissue) = (
-            self.loss / weight,
-            self.color.map(|v| v / weight),
-            self.tissue.map(|v| v / weight),
-        );
-        if loss < LEAST_LOSS_LEVELS {
+        if self.loss / weight < LEAST_LOSS_LEVELS {
             return false;
         }
+        if self.colored < LEAST_COLORED_SHARE * weight {
+            return true;
+        }
+        let [color, tissue] = [self.color, self.tissue].map(|sum| sum.map(|v| v / self.colored));
         let noise = NOISE_LEVELS / self.pixels.max(1.0).sqrt();
         other_than_lit_and_white(color, tissue) < MOST_OTHER_SHARE * length(color) + noise
     }
@@ -165,6 +175,20 @@ mod tests {
         for light in [0.08, 0.2, 0.5, 1.0, 2.0] {
             assert!(patch(shone(light)).is_the_lamps(), "{light}");
         }
+    }
+
+    #[test]
+    fn a_clipped_core_does_not_speak_of_colour() {
+        // A gleam on a yellow gall bladder: red and green are at their end, blue goes on.
+        let tissue = [205.0, 160.0, 105.0];
+        let mut gleam = patch_on(tissue, [22.0, 27.0, 33.0]);
+        for _ in 0..60 {
+            gleam.add([255.0, 255.0, 250.0], tissue);
+        }
+        assert!(gleam.is_the_lamps());
+        let mut clipped = Change::default();
+        clipped.add([255.0; 3], tissue);
+        assert!(clipped.is_the_lamps());
     }
 
     #[test]
