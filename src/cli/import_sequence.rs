@@ -125,6 +125,11 @@ fn trajectory(args: &Args, sequences: &[MetaSequence]) -> anyhow::Result<Option<
         (None, _) => bail!(UsageError(format!("--pose: expected one of {}, found none", list()))),
     };
     for name in std::iter::once(wanted).chain(&args.reference) {
+        if names.is_empty() {
+            bail!(
+                "expected a sequence with poses for `{name}`, found none in the files given: is the tracker's file among them?"
+            );
+        }
         if !names.contains(&name) {
             bail!(UsageError(format!("expected a pose out of {}, found {name}", list())));
         }
