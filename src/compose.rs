@@ -22,8 +22,7 @@ use crate::stages::specularity_detection::SpecularityDetection;
 use crate::stages::specularity_substitution::stage::{SpecularitySubstitution, Witnesses};
 use crate::stages::temporal_median::stage::TemporalMedian;
 use crate::stages::undistortion::{self, Undistortion};
-use crate::stages::waiting::Waiting;
-use crate::stages::{color_normalization, temporal_median};
+use crate::stages::{color_normalization, pose_refinement, temporal_median};
 use crate::time::Span;
 
 /// A part of the line that a user chooses by name.
@@ -78,7 +77,7 @@ pub struct Equipment<'a> {
     pub recording: &'a Recording,
     /// What other views saw.
     pub light_field: Option<Arc<LightField>>,
-    /// True when a light field is still on its way: its stages have their places in the line, for [`light_field_stages`] to take.
+    /// True when a light field is still on its way: its stages wait for it at the line's [`LightFieldDoor`].
     pub light_field_to_come: bool,
     /// Whether the line may wait for work on a frame, as on a recording: then a light field can be made of its own last frames.
     pub may_wait: bool,
@@ -96,6 +95,32 @@ pub struct Line {
     pub left_out: Vec<LeftOut>,
     /// Explains the pixels that leave the line, where known beforehand.
     pub output_camera: Option<Arc<CameraModel>>,
+    /// Where light fields enter, if there are stages for one.
+    pub light_field_door: Option<LightFieldDoor>,
+}
+
+/// Where light fields enter a line: the one way, before its first frame and while it runs, for surveys and for those of the last frames.
+#[derive(Clone, Debug)]
+pub struct LightFieldDoor {
+    alignment: pose_refinement::Settings,
+    /// Of stages that know no time offset of their own.
+    time_offset: Option<Slot<Span>>,
+    reference: Slot<Reference>,
+    witnesses: Slot<Witnesses>,
+}
+
+impl LightFieldDoor {
+    /// Make the light field ready, in the caller's thread; each stage takes its part before its next frame.
+    pub fn bring(&self, light_field: Arc<LightField>) {
+        let offset = light_field.time_offset;
+        let reference = Reference::new(Arc::clone(&light_field), &self.alignment);
+        let witnesses = Witnesses::new(light_field);
+        if let Some(slot) = self.time_offset.as_ref().filter(|_| offset != Span(0)) {
+            slot.put(offset);
+        }
+        self.reference.put(reference);
+        self.witnesses.put(witnesses);
+    }
 }
 
 /// Why a line cannot be put together.
@@ -142,6 +167,7 @@ pub fn line(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>) -> Re
         stages: Vec::new(),
         left_out: Vec::new(),
         output_camera: None,
+        light_field_door: None,
     };
 
     if wants(Choice::Median) {
@@ -207,51 +233,46 @@ fn specular(config: &Config, wanted: &[Choice], equipment: &Equipment<'_>, line:
             format!("no {missing} beside the video, so the camera is looked for in the picture alone"),
         );
     }
-    match &equipment.light_field {
-        Some(light_field) => line.stages.extend(light_field_stages(config, equipment, light_field)?),
-        None if rolls => rolling(config, equipment, line)?,
-        None => {
-            if has_poses && recording.hand_eye.is_some() {
-                line.stages.push(Box::new(Waiting(POSE_STAMPING)));
-            }
-            line.stages.push(Box::new(Waiting(POSE_REFINEMENT)));
-            line.stages
-                .push(Box::new(SpecularitySubstitution::new(&config.substitution, None)));
-        }
+    light_field_stages(config, equipment, rolls, line)
+}
+
+/// The stages that use a light field, in the order of the line, and the door by which it comes.
+fn light_field_stages(config: &Config, equipment: &Equipment<'_>, rolls: bool, line: &mut Line) -> Result<(), ComposeError> {
+    let mut door = LightFieldDoor {
+        alignment: config.pose_refinement.clone(),
+        time_offset: None,
+        reference: Slot::new(),
+        witnesses: Slot::new(),
+    };
+    if let Some(stamping) = stamping(config, equipment, &mut door)? {
+        line.stages.push(Box::new(stamping));
     }
+    if equipment.light_field.is_none() && rolls {
+        let maker = made_at_once(config, door.clone());
+        line.stages.push(Box::new(RollingLightField::new(&config.rolling, maker)));
+    }
+    line.stages.push(Box::new(PoseRefinement::awaiting(
+        &config.pose_refinement,
+        door.reference.clone(),
+    )));
+    line.stages.push(Box::new(SpecularitySubstitution::awaiting(
+        &config.substitution,
+        door.witnesses.clone(),
+    )));
+    if let Some(light_field) = &equipment.light_field {
+        door.bring(Arc::clone(light_field));
+    }
+    line.light_field_door = Some(door);
     Ok(())
 }
 
-/// Names of the stages whose places are kept while a light field is on its way.
-const POSE_STAMPING: &str = "pose";
-const POSE_REFINEMENT: &str = "pose_refinement";
-
-/// The names of the stages of a line that only keep a place.
-pub fn waiting_stages() -> [&'static str; 2] {
-    [POSE_STAMPING, POSE_REFINEMENT]
+/// The names of the stages that have nothing to do before there is a light field.
+pub fn idle_without_light_field() -> [&'static str; 2] {
+    ["pose", "pose_refinement"]
 }
 
-/// The stages that need a light field, in the order of the line.
-pub fn light_field_stages(
-    config: &Config,
-    equipment: &Equipment<'_>,
-    light_field: &Arc<LightField>,
-) -> Result<Vec<Box<dyn Stage>>, ComposeError> {
-    let mut stages: Vec<Box<dyn Stage>> = Vec::new();
-    stages.extend(stamping(config, equipment, light_field.time_offset)?);
-    stages.push(Box::new(PoseRefinement::new(
-        &config.pose_refinement,
-        Arc::clone(light_field),
-    )));
-    stages.push(Box::new(SpecularitySubstitution::new(
-        &config.substitution,
-        Some(Arc::clone(light_field)),
-    )));
-    Ok(stages)
-}
-
-/// The stage that knows the arm's poses; `of_survey` is the time offset where the hand-eye file tells none.
-fn stamping(config: &Config, equipment: &Equipment<'_>, of_survey: Span) -> Result<Option<Box<dyn Stage>>, ComposeError> {
+/// The stage that knows the arm's poses. Where the hand-eye file tells no time offset, the survey's is taken.
+fn stamping(config: &Config, equipment: &Equipment<'_>, door: &mut LightFieldDoor) -> Result<Option<PoseStamping>, ComposeError> {
     let recorded = || equipment.recording.trajectory.as_ref();
     let poses = match &equipment.poses {
         Some(poses) => Some(poses.clone()),
@@ -262,36 +283,22 @@ fn stamping(config: &Config, equipment: &Equipment<'_>, of_survey: Span) -> Resu
     let (Some(poses), Some(hand_eye)) = (poses, &equipment.recording.hand_eye) else {
         return Ok(None);
     };
-    let mut stamping = PoseStamping::new(poses, hand_eye.clone());
-    if hand_eye.time_offset.is_none() && of_survey != Span(0) {
-        stamping = stamping.with_time_offset(of_survey);
+    let stamping = PoseStamping::new(poses, hand_eye.clone());
+    if hand_eye.time_offset.is_some() {
+        return Ok(Some(stamping));
     }
-    Ok(Some(Box::new(stamping)))
-}
-
-/// The stages that make a light field of the video's own last frames, and use it.
-fn rolling(config: &Config, equipment: &Equipment<'_>, line: &mut Line) -> Result<(), ComposeError> {
-    line.stages.extend(stamping(config, equipment, Span(0))?);
-    let (reference, witnesses) = (Slot::new(), Slot::new());
-    let maker = made_at_once(config, reference.clone(), witnesses.clone());
-    line.stages.push(Box::new(RollingLightField::new(&config.rolling, maker)));
-    line.stages
-        .push(Box::new(PoseRefinement::awaiting(&config.pose_refinement, reference)));
-    line.stages
-        .push(Box::new(SpecularitySubstitution::awaiting(&config.substitution, witnesses)));
-    Ok(())
+    let newer = door.time_offset.insert(Slot::new()).clone();
+    Ok(Some(stamping.awaiting(newer)))
 }
 
 /// Makes each light field before the frame that called for it goes on: on a recording nothing hurries, and every run is alike.
-fn made_at_once(config: &Config, reference: Slot<Reference>, witnesses: Slot<Witnesses>) -> Maker {
-    let (trust, settings, alignment) = (config.survey.clone(), config.rolling.clone(), config.pose_refinement.clone());
+fn made_at_once(config: &Config, door: LightFieldDoor) -> Maker {
+    let (trust, settings) = (config.survey.clone(), config.rolling.clone());
     let mut told = false;
     Box::new(move |batch, camera| match batch.built(camera, &trust, &settings, &Silent) {
         Ok(light_field) => {
             tracing::debug!("a light field of {} of the last frames", light_field.views.len());
-            let light_field = Arc::new(light_field);
-            reference.put(Reference::new(Arc::clone(&light_field), &alignment));
-            witnesses.put(Witnesses::new(light_field));
+            door.bring(Arc::new(light_field));
         }
         Err(error) if !told => {
             told = true;

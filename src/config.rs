@@ -13,8 +13,10 @@ use crate::image::{field_of_view, specularity};
 use crate::light_field::prior::PriorSettings;
 use crate::light_field::rolling;
 use crate::pipeline::live;
+use crate::pipeline::scheduling;
 use crate::robot::feed;
 use crate::robot::pose_buffer::{self, PoseBuffer};
+use crate::sinks::virtual_camera;
 use crate::sources::camera::settings as camera;
 use crate::stages::{color_normalization, pose_refinement, specularity_substitution, temporal_median, undistortion};
 
@@ -130,6 +132,10 @@ pub struct Config {
     pub live: live::Settings,
     /// The camera of a live line.
     pub camera: camera::Settings,
+    /// What other programs see of a live line.
+    pub virtual_camera: virtual_camera::Settings,
+    /// What the operating system is asked for.
+    pub scheduling: scheduling::Settings,
     /// The temporal color median.
     pub median: temporal_median::settings::Settings,
     /// Color normalization.
@@ -219,6 +225,8 @@ impl Config {
         within("output.crf", usize::from(self.output.crf), 0, 51)?;
         self.live.check()?;
         self.camera.check()?;
+        self.virtual_camera.check()?;
+        self.scheduling.check()?;
         self.median.check().map_err(|error| error.to_string())?;
         self.color.check().map_err(|error| error.to_string())?;
         if let Some(balance) = self.undistort.balance.filter(|balance| !(0.0..=1.0).contains(balance)) {

@@ -22,4 +22,7 @@ pub mod sources;
 pub mod stages;
 pub mod synthetic;
 pub mod time;
+#[cfg(all(target_os = "linux", feature = "v4l2"))]
+pub mod video4linux;
+pub mod viewer;
 pub mod yaml;

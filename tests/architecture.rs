@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 const FLOORS: &[&[&str]] = &[
     &["geometry", "image", "solver", "time", "progress", "yaml"],
     &["camera", "media", "quality", "robot"],
-    &["calibration", "frame", "light_field", "recording", "synthetic"],
+    &["calibration", "frame", "light_field", "recording", "synthetic", "video4linux"],
     &["pipeline", "localization"],
     &["sources", "stages", "sinks"],
-    &["config"],
+    &["config", "viewer"],
     &["compose"],
     &["cli"],
 ];

@@ -119,6 +119,100 @@ fn a_recording_is_played_live_and_its_arm_is_heard() {
 }
 
 #[test]
+fn a_light_field_read_beside_the_line_fills_specularities_and_its_files_may_be_ruined_then() {
+    let folder = tempfile::tempdir().unwrap();
+    let (operation, light_field) = (folder.path().join("op"), folder.path().join("op.lf"));
+    let live = operation.join("live");
+    for arguments in [
+        // Slow pictures, that a busy machine has time for them.
+        &[
+            "simulate",
+            arg(&operation),
+            "--size",
+            "320x180",
+            "--frames",
+            "24",
+            "--fps",
+            "6",
+            "--seed",
+            "3",
+        ][..],
+        &[
+            "light-field",
+            "build",
+            arg(&operation.join("survey")),
+            "-o",
+            arg(&light_field),
+        ],
+    ] {
+        let output = endofield(&[arguments, &["-q"]].concat());
+        assert!(output.status.success(), "{}", text(&output.stderr));
+    }
+    let mut child = Command::new(env!("CARGO_BIN_EXE_endofield"))
+        .args([
+            "live",
+            "--recording",
+            arg(&live),
+            "--light-field",
+            arg(&light_field),
+            "--headless",
+        ])
+        .args([
+            "--progress",
+            "json",
+            "--duration",
+            "60",
+            "--set",
+            "live.hang_ms=1000",
+            "--set",
+            "live.deadline_ms=150",
+        ])
+        .args(["--set", "live.budget_ms=120"])
+        .stderr(std::process::Stdio::piped())
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut reader = std::io::BufReader::new(child.stderr.take().unwrap());
+    let mut told = String::new();
+    let mut until = |is_it: &dyn Fn(&serde_json::Value) -> bool| loop {
+        let mut line = String::new();
+        let read = std::io::BufRead::read_line(&mut reader, &mut line).unwrap();
+        assert!(read > 0, "the line ended before: {told}");
+        told += &line;
+        if let Ok(state) = serde_json::from_str::<serde_json::Value>(&line)
+            && is_it(&state)
+        {
+            return state;
+        }
+    };
+    let covers = |state: &serde_json::Value| state["covered"].as_f64().is_some_and(|share| share > 0.4);
+    let out = |state: &serde_json::Value| state["frames"]["out"].as_u64().unwrap_or(0);
+    // Pictures are there before the light field is.
+    let first = until(&|state| out(state) > 0);
+    assert!(!covers(&first), "{first}");
+    let filled = until(&|state| covers(state));
+    assert_eq!(filled["light_field"], "ready", "{filled}");
+    ruin(&light_field);
+    let later = until(&|state| out(state) > out(&filled) + 30);
+    assert!(covers(&later) && later["light_field"] == "ready", "{later}");
+    let pid = rustix::process::Pid::from_child(&child);
+    rustix::process::kill_process(pid, rustix::process::Signal::INT).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+}
+
+/// Overwrite every file.
+fn ruin(folder: &Path) {
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            ruin(&path);
+        } else {
+            std::fs::write(path, b"not what it was").unwrap();
+        }
+    }
+}
+
+#[test]
 fn without_its_camera_live_waits_and_ends_cleanly_when_told() {
     let mut child = Command::new(env!("CARGO_BIN_EXE_endofield"))
         .args(["live", "--device", "/dev/video-that-is-not-there", "--progress", "json"])

@@ -16,6 +16,8 @@ mod cli;
 mod color;
 mod config;
 mod determinism;
+mod drift;
+mod fault_campaign;
 mod feed;
 mod feed_fuzz;
 mod hand_eye;

@@ -137,6 +137,7 @@ pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> any
         stages,
         left_out,
         output_camera,
+        ..
     } = compose::line(&context.config, &args.stages, &equipment)?;
     for part in &left_out {
         tracing::warn!("{part}");

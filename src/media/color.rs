@@ -162,6 +162,7 @@ pub(crate) fn converts_directly(format: Pixel) -> bool {
             | Pixel::YUV420P10LE
             | Pixel::YUV422P10LE
             | Pixel::RGB24
+            | Pixel::GBRP
     )
 }
 
@@ -173,6 +174,17 @@ pub(crate) fn rgb_from_frame(frame: &frame::Video, tags: &ColorTags, out: &mut I
     let rgb = out.as_bytes_mut();
     match frame.format() {
         Pixel::RGB24 => copy_rows(frame.data(0), frame.stride(0), rgb, rgb_stride as usize),
+        Pixel::GBRP => {
+            let rows = |plane: usize| frame.data(plane).chunks(frame.stride(plane).max(1));
+            let planes = rows(2).zip(rows(0)).zip(rows(1));
+            for (to, ((red, green), blue)) in rgb.chunks_exact_mut(rgb_stride as usize).zip(planes) {
+                let samples = red.iter().zip(green).zip(blue);
+                for (pixel, ((&red, &green), &blue)) in to.chunks_exact_mut(3).zip(samples) {
+                    pixel.copy_from_slice(&[red, green, blue]);
+                }
+            }
+            Ok(())
+        }
         Pixel::GRAY8 => {
             let image = YuvGrayImage {
                 y_plane: frame.data(0),

@@ -11,6 +11,7 @@ pub mod error;
 pub mod filter;
 pub mod frame_index;
 pub mod image_files;
+pub mod layout;
 pub mod libav;
 pub mod reader;
 pub mod sound;

@@ -55,6 +55,8 @@ impl Output {
 pub enum Content {
     /// Colour pictures, visually lossless.
     Color,
+    /// Colour pictures, bit for bit; in a container only.
+    Lossless,
     /// 8-bit masks, lossless.
     Mask,
 }
@@ -215,7 +217,8 @@ impl VideoWriter {
 
     /// Write a colour picture.
     pub fn write(&mut self, picture: &Image<Rgb8>, timestamp: Timestamp) -> Result<(), MediaError> {
-        self.check(picture.size(), Content::Color)?;
+        let is_color = self.content != Content::Mask;
+        self.check(picture.size(), if is_color { self.content } else { Content::Color })?;
         match &mut self.kind {
             Kind::Container(writer) => writer.write_color(picture, timestamp),
             Kind::Images(writer) => writer.write(picture.as_bytes(), false),
@@ -235,7 +238,7 @@ impl VideoWriter {
 
     fn check(&self, found: (usize, usize), content: Content) -> Result<(), MediaError> {
         if content != self.content {
-            let expected = if self.content == Content::Color { "colour" } else { "mask" };
+            let expected = if self.content == Content::Mask { "mask" } else { "colour" };
             return Err(MediaError::WrongKind {
                 path: self.path.clone(),
                 expected,

@@ -34,8 +34,8 @@ impl Y4mWriter {
         let full = settings.content == Content::Mask || settings.color.range_name() == "pc";
         let sampling = match (settings.content, planes.subsampled()) {
             (Content::Mask, _) => "Cmono",
-            (Content::Color, true) => "C420jpeg",
-            (Content::Color, false) => "C444",
+            (Content::Color | Content::Lossless, true) => "C420jpeg",
+            (Content::Color | Content::Lossless, false) => "C444",
         };
         let (frames, seconds) = settings.average_frame_rate;
         let (across, down) = settings.pixel_aspect;

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::pipeline::live::Limits;
 use crate::pipeline::queue::{Overflow, Queue};
+use crate::pipeline::scheduling::{self, Scheduling};
 use crate::pipeline::stage::{Sink, Source, Stage};
 use crate::time::Clock;
 
@@ -45,6 +46,7 @@ pub struct Builder {
     between: usize,
     keep_original: bool,
     limits: Option<Limits>,
+    scheduling: Arc<Scheduling>,
     stages: Vec<Box<dyn Stage>>,
     taps: Vec<Door>,
     sinks: Vec<Door>,
@@ -58,6 +60,7 @@ pub struct Pipeline {
     pub(super) between: usize,
     pub(super) keep_original: bool,
     pub(super) limits: Option<Limits>,
+    pub(super) scheduling: Arc<Scheduling>,
     pub(super) stages: Vec<Box<dyn Stage>>,
     pub(super) taps: Vec<Door>,
     pub(super) sinks: Vec<Door>,
@@ -91,6 +94,7 @@ impl Pipeline {
             between: BETWEEN_STAGES,
             keep_original: false,
             limits: None,
+            scheduling: Arc::new(Scheduling::new(&scheduling::Settings::default())),
             stages: Vec::new(),
             taps: Vec::new(),
             sinks: Vec::new(),
@@ -124,6 +128,13 @@ impl Builder {
     #[must_use]
     pub fn live(mut self, limits: Limits) -> Self {
         self.limits = Some(limits);
+        self
+    }
+
+    /// What the operating system is asked for on behalf of the line's threads.
+    #[must_use]
+    pub fn scheduling(mut self, settings: &scheduling::Settings) -> Self {
+        self.scheduling = Arc::new(Scheduling::new(settings));
         self
     }
 
@@ -209,6 +220,7 @@ impl Builder {
             between: self.between,
             keep_original: self.keep_original,
             limits: self.limits,
+            scheduling: self.scheduling,
             stages: self.stages,
             taps: self.taps,
             sinks: self.sinks,

@@ -3,17 +3,12 @@
 //! They are atomics, read by a stage's thread once per frame; whoever holds the [`Controls`] may throw them from any thread.
 
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
-use std::sync::{Mutex, PoisonError};
-
-use crate::pipeline::stage::Stage;
 
 /// The switches of one stage.
 pub struct Switch {
     stage: &'static str,
     bypass: AtomicBool,
     strength_bits: AtomicU32,
-    is_replaced: AtomicBool,
-    replacement: Mutex<Option<Box<dyn Stage>>>,
 }
 
 impl std::fmt::Debug for Switch {
@@ -32,17 +27,7 @@ impl Switch {
             stage,
             bypass: AtomicBool::new(false),
             strength_bits: AtomicU32::new(NOT_SET),
-            is_replaced: AtomicBool::new(false),
-            replacement: Mutex::new(None),
         }
-    }
-
-    /// The stage that shall work instead from now on, if one was handed in since the last call.
-    pub(super) fn take_replacement(&self) -> Option<Box<dyn Stage>> {
-        if !self.is_replaced.swap(false, Ordering::AcqRel) {
-            return None;
-        }
-        self.replacement.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
     /// True when the stage is to be passed by.
@@ -113,20 +98,6 @@ impl Controls {
     pub fn resume(&self, stage: &str) -> Result<(), UnknownStage> {
         self.named(stage)?.bypass.store(false, Ordering::Relaxed);
         Ok(())
-    }
-
-    /// From the next frame on, let another stage of the same name do the work: one that knows more, or a new one for one that broke.
-    pub fn replace(&self, stage: Box<dyn Stage>) -> Result<(), UnknownStage> {
-        let switch = self.named(stage.name())?;
-        *switch.replacement.lock().unwrap_or_else(PoisonError::into_inner) = Some(stage);
-        switch.is_replaced.store(true, Ordering::Release);
-        Ok(())
-    }
-
-    /// True when another stage waits to take the place of the one at `position`.
-    pub(super) fn is_replaced(&self, position: usize) -> bool {
-        self.switch(position)
-            .is_some_and(|switch| switch.is_replaced.load(Ordering::Acquire))
     }
 
     /// True when the stage at `position` is to be passed by.

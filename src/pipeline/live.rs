@@ -49,6 +49,8 @@ pub struct Settings {
     pub rest_ms: f64,
     /// So many finished frames may wait for the recorder.
     pub frames_before_recorder: usize,
+    /// Whether what came in is recorded bit for bit.
+    pub lossless_recording: bool,
 }
 
 impl Default for Settings {
@@ -59,6 +61,7 @@ impl Default for Settings {
             hang_ms: 100.0,
             rest_ms: 3000.0,
             frames_before_recorder: 60,
+            lossless_recording: false,
         }
     }
 }

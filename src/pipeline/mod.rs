@@ -18,6 +18,7 @@ pub mod live;
 pub mod outcome;
 pub mod queue;
 pub mod runner;
+pub mod scheduling;
 pub mod seat;
 pub mod slot;
 pub mod stage;

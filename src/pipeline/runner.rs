@@ -40,6 +40,7 @@ use crate::pipeline::gate::{Gate, Handed};
 use crate::pipeline::ledger::{Ledger, Passed};
 use crate::pipeline::outcome::{Outcome, SinkOutcome, StageOutcome};
 use crate::pipeline::queue::{DropCount, Queue, Receiver, Sender};
+use crate::pipeline::scheduling::Scheduling;
 use crate::pipeline::seat::{Condition, Seat, StageDoor, Way};
 use crate::pipeline::timing::Summary;
 use crate::pipeline::watchdog::Watchdog;
@@ -126,15 +127,18 @@ impl std::fmt::Debug for RunningPipeline {
 /// Starts threads and keeps their handles; each holds an end of `ended` for as long as it lives.
 struct Crew {
     members: Vec<Member>,
+    scheduling: Arc<Scheduling>,
     alive: channel::Sender<()>,
 }
 
 impl Crew {
     fn start(&mut self, name: &str, seat: Option<usize>, work: impl FnOnce() -> Left + Send + 'static) -> Result<(), StartError> {
         let alive = self.alive.clone();
+        let scheduling = Arc::clone(&self.scheduling);
         let handle = std::thread::Builder::new()
             .name(name.to_owned())
             .spawn(move || {
+                scheduling.enter_thread();
                 let left = work();
                 drop(alive);
                 left
@@ -178,8 +182,10 @@ impl Crew {
 }
 
 /// Threads of a stage's own, so that one that hangs keeps none from the others.
-fn pool_of(stage: &'static str) -> Result<ThreadPool, StartError> {
+fn pool_of(stage: &'static str, scheduling: &Arc<Scheduling>) -> Result<ThreadPool, StartError> {
+    let scheduling = Arc::clone(scheduling);
     ThreadPoolBuilder::new()
+        .start_handler(move |_| scheduling.enter_thread())
         .thread_name(move |index| format!("{stage} {index}"))
         .build()
         .map_err(|error| StartError {
@@ -191,6 +197,7 @@ fn pool_of(stage: &'static str) -> Result<ThreadPool, StartError> {
 impl Pipeline {
     /// Start all threads.
     pub fn start(self) -> Result<RunningPipeline, StartError> {
+        self.scheduling.enter_program();
         let under_way = self.frames_under_way();
         let shared = Arc::new(Shared::default());
         let controls = Arc::new(Controls::for_stages(self.stages.iter().map(|stage| stage.name())));
@@ -203,6 +210,7 @@ impl Pipeline {
         let (alive, ended) = channel::bounded(1);
         let mut crew = Crew {
             members: Vec::new(),
+            scheduling: Arc::clone(&self.scheduling),
             alive,
         };
         let clock = self.clock;
@@ -246,7 +254,10 @@ impl Pipeline {
             seat.set_way(way.clone());
             let worker = StageWorker {
                 position,
-                own_pool: limits.is_some().then(|| pool_of(stage.name())).transpose()?,
+                own_pool: limits
+                    .is_some()
+                    .then(|| pool_of(stage.name(), &self.scheduling))
+                    .transpose()?,
                 stage,
                 controls: Arc::clone(&controls),
                 input,

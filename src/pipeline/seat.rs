@@ -133,8 +133,8 @@ impl Seat {
     }
 
     /// The stage panicked.
-    pub(super) fn set_broken(&self, broken: bool) {
-        self.broken.store(broken, Ordering::Release);
+    pub(super) fn set_broken(&self) {
+        self.broken.store(true, Ordering::Release);
     }
 
     pub(super) fn is_hanging(&self) -> bool {
@@ -241,8 +241,7 @@ impl Way {
         for StageDoor { seat, sender, position } in &self.stages {
             let now = self.clock.now();
             let switched_off = self.controls.is_bypassed(*position);
-            // Only the stage's own thread can let another take its place.
-            if self.controls.is_replaced(*position) || !seat.may_be_passed_by(now, switched_off) {
+            if !seat.may_be_passed_by(now, switched_off) {
                 seat.inside.fetch_add(1, Ordering::AcqRel);
                 match sender.push_unless(frame, || seat.is_hanging()) {
                     Ok(()) => return Ok(()),

@@ -35,7 +35,7 @@ impl Default for Settings {
             max_gap_ms: 200.0,
             max_extrapolation_ms: 50.0,
             smoothing_ms: 160.0,
-            kept_ms: 10_000.0,
+            kept_ms: 20_000.0,
         }
     }
 }
@@ -569,8 +569,8 @@ mod tests {
             }
             buffer.samples().count()
         });
-        // Ten seconds at 100 Hz, both ends.
-        assert_eq!(kept.unwrap(), 1001);
+        // Twenty seconds at 100 Hz, both ends.
+        assert_eq!(kept.unwrap(), 2001);
         buffer.clear();
         assert_eq!(buffer.pose_at(Timestamp(0)).unwrap_err(), PoseLookupError::Empty);
     }

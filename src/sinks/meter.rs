@@ -1,8 +1,10 @@
 //! The end of a line that nobody looks at: measures when frames were handed out, and how evenly.
 
+use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::frame::Frame;
+use crate::frame::{Frame, provenance_code};
+use crate::image::buffer::Mask;
 use crate::pipeline::stage::{Sink, SinkError};
 use crate::pipeline::timing::Durations;
 use crate::time::{Clock, Span, Timestamp};
@@ -44,6 +46,41 @@ impl StageTimes {
     }
 }
 
+/// How many of the specular pixels the light field covered.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+pub struct Coverage {
+    /// Frames that were looked at.
+    pub frames: u64,
+    /// Pixels that were filled with what other views saw.
+    pub filled: u64,
+    /// Specular pixels that were left as they came.
+    pub left: u64,
+}
+
+impl Coverage {
+    /// Of the specular pixels, the share that was filled; `None` when there were none.
+    pub fn share(&self) -> Option<f64> {
+        let all = self.filled + self.left;
+        (all > 0).then(|| self.filled as f64 / all as f64)
+    }
+
+    fn look(&mut self, codes: &Mask) {
+        self.frames += 1;
+        for code in codes.pixels() {
+            match *code {
+                provenance_code::LIGHT_FIELD | provenance_code::RECENT => self.filled += 1,
+                provenance_code::LEFT => self.left += 1,
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Every so many frames are looked at for their coverage.
+const COVERAGE_EVERY: u64 = 4;
+/// So many of those looked at are summed up.
+const COVERAGE_OVER: usize = 16;
+
 /// What a meter has measured.
 #[derive(Clone, Debug, Default)]
 pub struct Measured {
@@ -59,6 +96,8 @@ pub struct Measured {
     pub shown: Vec<Shown>,
     /// Frames seen.
     pub frames: u64,
+    /// Of the last few seconds.
+    pub coverage: Coverage,
 }
 
 /// Reads what a [`MeterSink`] measures.
@@ -76,6 +115,11 @@ impl MeterReading {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Measured::default();
     }
 
+    /// The specular pixels of the last frames.
+    pub fn coverage(&self) -> Coverage {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).coverage
+    }
+
     /// Frames seen.
     pub fn frames(&self) -> u64 {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).frames
@@ -86,8 +130,10 @@ impl MeterReading {
 pub struct MeterSink {
     clock: Arc<dyn Clock>,
     keep: usize,
+    frames: u64,
     reading: MeterReading,
     previous: Option<(Timestamp, Timestamp)>,
+    covered: VecDeque<Coverage>,
 }
 
 impl std::fmt::Debug for MeterSink {
@@ -102,9 +148,28 @@ impl MeterSink {
         Self {
             clock,
             keep,
+            frames: 0,
             reading: MeterReading::default(),
             previous: None,
+            covered: VecDeque::with_capacity(COVERAGE_OVER),
         }
+    }
+
+    /// The specular pixels of the last frames that were looked at.
+    fn coverage_with(&mut self, frame: &Frame) -> Coverage {
+        let mut one = Coverage::default();
+        if let Some(provenance) = &frame.provenance {
+            one.look(&provenance.code);
+        }
+        if self.covered.len() == COVERAGE_OVER {
+            self.covered.pop_front();
+        }
+        self.covered.push_back(one);
+        self.covered.iter().fold(Coverage::default(), |sum, one| Coverage {
+            frames: sum.frames + one.frames,
+            filled: sum.filled + one.filled,
+            left: sum.left + one.left,
+        })
     }
 
     /// Reads what is measured.
@@ -121,7 +186,10 @@ impl Sink for MeterSink {
     fn consume(&mut self, frame: &Arc<Frame>) -> Result<(), SinkError> {
         let now = self.clock.now();
         let latency = now - frame.arrived_at;
+        self.frames += 1;
+        let coverage = (self.frames % COVERAGE_EVERY == 1).then(|| self.coverage_with(frame));
         let mut measured = self.reading.0.lock().unwrap_or_else(PoisonError::into_inner);
+        measured.coverage = coverage.unwrap_or(measured.coverage);
         let mut sent = frame.arrived_at;
         for timing in &frame.timings {
             let place = measured.stages.iter().position(|stage| stage.name == timing.stage);

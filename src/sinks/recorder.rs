@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use crossbeam::channel::Receiver;
 
 use crate::frame::Frame;
-use crate::media::writer::{Output, VideoWriter, WriterSettings};
+use crate::media::writer::{Content, Output, VideoWriter, WriterSettings};
 use crate::pipeline::stage::{Sink, SinkError};
 use crate::robot::feed::message::Sample;
 use crate::robot::trajectory::{stamp_text, tum_head, tum_line};
@@ -54,9 +54,31 @@ impl RecorderReading {
     }
 }
 
+/// What is recorded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Track {
+    /// What came in: `video.mkv`, its times in `frames.csv`, the arm's poses.
+    Raw,
+    /// What went out: `enhanced.mkv`, its times in `enhanced.csv`.
+    Enhanced,
+}
+
+impl Track {
+    fn files(self) -> [&'static str; 2] {
+        match self {
+            Self::Raw => ["video.mkv", "frames.csv"],
+            Self::Enhanced => ["enhanced.mkv", "enhanced.csv"],
+        }
+    }
+}
+
 /// Where and how to record.
 #[derive(Clone, Debug)]
 pub struct RecorderSettings {
+    /// What.
+    pub track: Track,
+    /// [`Content::Color`] or [`Content::Lossless`].
+    pub content: Content,
     /// The folder of the first part.
     pub folder: PathBuf,
     /// Frames a second, for the container.
@@ -70,6 +92,7 @@ pub struct RecorderSettings {
 struct Part {
     video: VideoWriter,
     frames: File,
+    times_name: &'static str,
     poses: Option<File>,
     folder: PathBuf,
     size: (usize, usize),
@@ -127,16 +150,18 @@ impl RecorderSink {
         let rate = ((self.settings.frame_rate_hz * 1e3).round().max(1.0) as i32, 1000);
         let mut writing = WriterSettings::new(width, height, rate);
         writing.origin = frame.exposed_at;
-        let path = folder.join("video.mkv");
+        writing.content = self.settings.content;
+        let [video_name, times_name] = self.settings.track.files();
+        let path = folder.join(video_name);
         let video = VideoWriter::create(&Output::File(path), &writing, true).map_err(|error| error.to_string())?;
         let make = |name: &str| {
             let path = folder.join(name);
             File::create(&path).map_err(|error| said(&path, &error))
         };
-        let mut frames = make("frames.csv")?;
+        let mut frames = make(times_name)?;
         frames
             .write_all(b"frame,timestamp_s\n")
-            .map_err(|error| said(&folder.join("frames.csv"), &error))?;
+            .map_err(|error| said(&folder.join(times_name), &error))?;
         let poses = match &self.arm {
             Some(_) => {
                 let mut file = make("poses.tum")?;
@@ -150,6 +175,7 @@ impl RecorderSink {
         Ok(Part {
             video,
             frames,
+            times_name,
             poses,
             folder,
             size: (width, height),
@@ -202,7 +228,7 @@ impl Part {
         let line = format!("{},{}\n", self.written, stamp_text(frame.exposed_at));
         self.frames
             .write_all(line.as_bytes())
-            .map_err(|error| format!("cannot write {}: {error}", self.folder.join("frames.csv").display()))?;
+            .map_err(|error| format!("cannot write {}: {error}", self.folder.join(self.times_name).display()))?;
         self.written += 1;
         Ok(())
     }
@@ -225,7 +251,10 @@ impl Part {
 
 impl Sink for RecorderSink {
     fn name(&self) -> &'static str {
-        "recorder"
+        match self.settings.track {
+            Track::Raw => "recorder",
+            Track::Enhanced => "enhanced recorder",
+        }
     }
 
     fn consume(&mut self, frame: &Arc<Frame>) -> Result<(), SinkError> {
@@ -235,11 +264,11 @@ impl Sink for RecorderSink {
         }
         let was_failing = self.retry_at.take().is_some();
         match self.record(frame) {
-            Ok(()) if was_failing => tracing::info!("recorder: records again, as part {}", self.parts),
+            Ok(()) if was_failing => tracing::info!("{}: records again, as part {}", self.name(), self.parts),
             Ok(()) => {}
             Err(reason) => {
                 if !was_failing {
-                    tracing::error!("recorder: {reason}; frames are lost until it can be written again");
+                    tracing::error!("{}: {reason}; frames are lost until it can be written again", self.name());
                 }
                 self.retry_at = Some(frame.exposed_at + RETRY);
                 self.reading.change(|recorded| {
@@ -278,6 +307,8 @@ mod tests {
 
     fn settings(folder: &Path) -> RecorderSettings {
         RecorderSettings {
+            track: Track::Raw,
+            content: Content::Color,
             folder: folder.to_owned(),
             frame_rate_hz: 25.0,
             beside: Vec::new(),
@@ -307,6 +338,48 @@ mod tests {
             assert!(picture.image.at(5, 5)[1].abs_diff(10 + 8 * number as u8) <= 2);
         }
         assert!(reader.next_frame(&pool).unwrap().is_none());
+    }
+
+    /// Every pixel another.
+    fn noise(number: u64, (width, height): (usize, usize)) -> Arc<Frame> {
+        let at = Timestamp(7_000_000_000 + number as i64 * 33_366_700);
+        let mut image = Pool::new(1).take(width, height);
+        let mut state = 0x9e37_79b9_u32.wrapping_mul(number as u32 + 1);
+        for byte in image.as_bytes_mut() {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            *byte = (state >> 24) as u8;
+        }
+        Arc::new(Frame::new(FrameId(number), at, at, image))
+    }
+
+    #[test]
+    fn both_tracks_lie_beside_each_other_and_a_lossless_one_comes_back_bit_for_bit() {
+        let folder = tempfile::tempdir().unwrap();
+        // Odd sizes have no 4:2:0.
+        for size in [(64, 48), (63, 47)] {
+            let path = folder.path().join(format!("rec{}", size.0));
+            for (track, content) in [(Track::Raw, Content::Lossless), (Track::Enhanced, Content::Color)] {
+                let settings = RecorderSettings {
+                    track,
+                    content,
+                    ..settings(&path)
+                };
+                let mut sink = RecorderSink::new(settings, None).unwrap();
+                (0..12).for_each(|number| sink.consume(&noise(number, size)).unwrap());
+                sink.finish().unwrap();
+            }
+            assert!(path.join("enhanced.mkv").is_file() && path.join("enhanced.csv").is_file());
+            let recording = Recording::open(&path).unwrap();
+            let times = recording.frame_times.unwrap();
+            let mut reader = VideoReader::open(&Input::from_argument(recording.video.path())).unwrap();
+            let pool = Pool::new(1);
+            for number in 0..12 {
+                let (was, is) = (noise(number, size), reader.next_frame(&pool).unwrap().unwrap());
+                assert_eq!(times[number as usize], was.exposed_at);
+                assert!(was.image.as_bytes() == is.image.as_bytes(), "frame {number} of {size:?}");
+            }
+            assert!(reader.next_frame(&pool).unwrap().is_none());
+        }
     }
 
     #[test]

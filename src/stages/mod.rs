@@ -9,4 +9,3 @@ pub mod specularity_detection;
 pub mod specularity_substitution;
 pub mod temporal_median;
 pub mod undistortion;
-pub mod waiting;

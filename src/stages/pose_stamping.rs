@@ -6,6 +6,7 @@
 use crate::frame::{Frame, PoseOrigin};
 use crate::geometry::space::{RobotBase, World};
 use crate::geometry::transform::Transform;
+use crate::pipeline::slot::Slot;
 use crate::pipeline::stage::{Stage, StageError};
 use crate::robot::feed::reader::SharedPoses;
 use crate::robot::hand_eye::HandEye;
@@ -57,6 +58,8 @@ pub struct PoseStamping {
     poses: Poses,
     hand_eye: HandEye,
     time_offset: Span,
+    /// Where a better time offset comes.
+    newer: Slot<Span>,
     world_from_base: Transform<World, RobotBase>,
 }
 
@@ -68,8 +71,16 @@ impl PoseStamping {
             poses,
             hand_eye,
             time_offset,
+            newer: Slot::new(),
             world_from_base: Transform::identity(),
         }
+    }
+
+    /// Every time offset that comes there is taken from then on, as one that was found with a light field.
+    #[must_use]
+    pub fn awaiting(mut self, newer: Slot<Span>) -> Self {
+        self.newer = newer;
+        self
     }
 
     /// With another time offset, as estimated from the pictures.
@@ -85,6 +96,9 @@ impl Stage for PoseStamping {
     }
 
     fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
+        if let Some(newer) = self.newer.take() {
+            self.time_offset = newer;
+        }
         let Ok(pose) = self.poses.pose_at(frame.exposed_at, self.time_offset) else {
             frame.world_from_camera = None;
             frame.pose_origin = PoseOrigin::Missing;

@@ -2,4 +2,5 @@
 
 pub mod command;
 pub mod line;
+pub mod played_camera;
 pub mod scene;

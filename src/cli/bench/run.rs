@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::cli::bench::plot;
 use crate::cli::bench::report::{BenchReport, Circumstances, write_csv};
+use crate::cli::bench::{glass, plot};
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
 use crate::cli::live::session::{LightFieldState, Plan, Session};
@@ -35,6 +35,12 @@ enum What {
     /// How many frames a second the line can: nothing is skipped or dropped.
     #[command(after_help = "Example:\n  endofield bench throughput --recording recordings/live --light-field survey.lf")]
     Throughput(Measuring),
+    /// How long a picture takes from a screen, by way of a camera that looks at it, until it arrives here.
+    #[command(
+        after_help = "The display is an output node that the camera's node is the other side of (v4l2loopback), or an output whose \
+        cable leads back to a capture card.\nExample:\n  endofield bench glass-to-glass --virtual-camera /dev/video10 --device /dev/video10"
+    )]
+    GlassToGlass(glass::Args),
 }
 
 #[derive(Clone, Debug, clap::Args)]
@@ -85,6 +91,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     match &args.what {
         What::Latency(measuring) => measure("latency", measuring, context),
         What::Throughput(measuring) => measure("throughput", measuring, context),
+        What::GlassToGlass(args) => glass::run(args, context),
     }
 }
 
@@ -130,6 +137,9 @@ fn measure(kind: &'static str, args: &Measuring, context: &Context) -> anyhow::R
         stages: &args.stages,
         light_field: args.light_field.as_deref(),
         record: None,
+        record_enhanced: false,
+        virtual_camera: None,
+        display: None,
         trace: args.trace.as_deref(),
         keep: KEEP,
         patient,

@@ -1,17 +1,21 @@
 //! `live` itself: what a user types, and the loop that watches.
 
 use std::path::{Path, PathBuf};
+#[cfg(feature = "viewer")]
+use std::sync::Arc;
 
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
 use crate::cli::live::session::{Plan, Session};
 use crate::cli::live::source::{self, Wanted, size_from_word};
-use crate::cli::live::status::{Rate, Snapshot};
+use crate::cli::live::watch::Watcher;
 use crate::cli::outputs::Outputs;
 use crate::compose::Choice;
 use crate::pipeline::outcome::Outcome;
-use crate::progress::Progress as _;
+use crate::sinks::display::Display;
 use crate::time::{Clock as _, MonotonicClock, Span};
+#[cfg(feature = "viewer")]
+use crate::viewer::window::{Look, Place, WindowSystem};
 
 /// Drawn pictures are of this size and rate unless told otherwise.
 const DRAWN_SIZE: (usize, usize) = (1280, 720);
@@ -25,7 +29,7 @@ const DRAWN_RATE_HZ: f64 = 30.0;
 #[command(
     after_help = "Examples:\n  endofield live --list\n  endofield live --device /dev/video0 --size 1920x1080 --fps 30 --arm /dev/ttyUSB0 --light-field survey.lf\n  \
     endofield live --recording recordings/live --light-field survey.lf --duration 20\n  endofield live --synthetic --duration 5\n\n\
-    Ends with Ctrl-C (exit code 130) or after --duration. Settings: [live], [camera] and [arm] in config/default.toml."
+    Keys of the window: h shows them; Escape brings the raw picture. Ends with q, with Ctrl-C (exit code 130) or after --duration. Settings: [live], [camera] and [arm] in config/default.toml."
 )]
 pub struct Args {
     /// The camera's or capture card's node [default: camera.device].
@@ -61,12 +65,21 @@ pub struct Args {
     /// Record what comes in, as a recording that `process` plays.
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
+    /// Record the enhanced picture as well, beside what comes in.
+    #[arg(long, requires = "record")]
+    record_enhanced: bool,
+    /// Show the enhanced picture to other programs as a camera: an output node of Video4Linux2, as the module v4l2loopback gives.
+    #[arg(long, value_name = "/dev/videoN")]
+    virtual_camera: Option<PathBuf>,
     /// Write what each stage did when, for Perfetto or about:tracing.
     #[arg(long, value_name = "FILE.json")]
     trace: Option<PathBuf>,
-    /// Without a window. There is none yet: this changes nothing.
+    /// Without a window.
     #[arg(long)]
     headless: bool,
+    /// The window takes all of this monitor, counted from 0.
+    #[arg(long, value_name = "MONITOR", num_args = 0..=1, default_missing_value = "0", conflicts_with = "headless")]
+    full_screen: Option<usize>,
     /// End after so many seconds.
     #[arg(long, value_name = "S", allow_negative_numbers = true)]
     duration: Option<f64>,
@@ -104,6 +117,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         .collect();
     outputs.check(&inputs, context)?;
 
+    let window = window(args);
     let is_camera = matches!(wanted, Wanted::Camera(_));
     let plan = Plan {
         wanted,
@@ -117,36 +131,22 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         stages: &args.stages,
         light_field: args.light_field.as_deref(),
         record: args.record.as_deref(),
+        record_enhanced: args.record_enhanced,
+        virtual_camera: args.virtual_camera.as_deref(),
+        display: window.as_ref().map(|(_, display)| display.clone()),
         trace: args.trace.as_deref(),
         keep: 0,
         patient: false,
     };
-    let mut session = Session::start(&plan, &config)?;
+    let session = Session::start(&plan, &config)?;
     for part in &session.left_out {
         tracing::warn!("{part}");
     }
     let end = args.duration.map(|seconds| began + Span::from_seconds(seconds));
-    let mut live = context.console.live_line();
-    let mut rate = Rate::default();
-    let mut first_told = false;
-    let mut stopped_by_user = false;
-    while !session.line.has_ended() {
-        session.line.wait_a_moment();
-        let now = MonotonicClock.now();
-        if !first_told && session.meter.frames() > 0 {
-            first_told = true;
-            tracing::info!("first picture after {:.2} s; {}", (now - began).seconds(), session.name);
-        }
-        let snapshot = Snapshot::of(&mut session, &mut rate, now);
-        live.update(|| snapshot.line(), || snapshot.json("progress"));
-        stopped_by_user |= context.console.stopping();
-        if stopped_by_user || end.is_some_and(|end| now >= end) {
-            session.stop();
-        }
-    }
-    let snapshot = Snapshot::of(&mut session, &mut rate, MonotonicClock.now());
-    live.last(|| snapshot.json("end"));
-    drop(live);
+    let mut watcher = Watcher::new(context, session, began, end);
+    show(window, args, &mut watcher);
+    watcher.wait();
+    let (session, stopped_by_user) = watcher.finish();
     let Session {
         line, arm, camera, name, ..
     } = session;
@@ -175,6 +175,54 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         (false, false) => Ended::Incomplete,
     })
 }
+
+/// The way to the window system, and where frames wait to be shown.
+#[cfg(feature = "viewer")]
+type Shown = (WindowSystem, Display);
+
+#[cfg(not(feature = "viewer"))]
+type Shown = ((), Display);
+
+#[cfg(feature = "viewer")]
+fn window(args: &Args) -> Option<Shown> {
+    if args.headless {
+        return None;
+    }
+    match WindowSystem::open() {
+        Ok(system) => {
+            let display = Display::new(system.wake());
+            Some((system, display))
+        }
+        Err(error) => {
+            tracing::warn!("{error}: the line runs without one; --headless says that none is wanted");
+            None
+        }
+    }
+}
+
+#[cfg(not(feature = "viewer"))]
+fn window(_args: &Args) -> Option<Shown> {
+    None
+}
+
+/// Show the line in its window until either ends; the line outlives a window that fails.
+#[cfg(feature = "viewer")]
+fn show(window: Option<Shown>, args: &Args, watcher: &mut Watcher<'_>) {
+    let Some((system, display)) = window else { return };
+    let place = Place {
+        title: format!("endofield: {}", watcher.session.name),
+        full_screen: args.full_screen,
+        snapshots: args.record.clone().unwrap_or_else(|| PathBuf::from(".")),
+    };
+    let controls = Arc::clone(watcher.session.line.controls());
+    let look = |wants_to_end: bool| watcher.look(wants_to_end).map_or(Look::Ended, Look::Runs);
+    if let Err(error) = system.run(place, display, controls, look) {
+        tracing::error!("{error}: the line goes on without it");
+    }
+}
+
+#[cfg(not(feature = "viewer"))]
+fn show(_window: Option<Shown>, _args: &Args, _watcher: &mut Watcher<'_>) {}
 
 fn check(args: &Args) -> Result<(), UsageError> {
     if let Some(seconds) = args.duration.filter(|s| !(*s > 0.0 && *s <= 1e9)) {

@@ -9,22 +9,24 @@ use anyhow::Context as _;
 use crossbeam::channel::bounded;
 
 use crate::cli::live::source::{Making, Ready, Wanted, calibration_files};
-use crate::compose::{self, Choice, Equipment, LeftOut, Line};
+use crate::compose::{self, Choice, Equipment, LeftOut, LightFieldDoor, Line};
 use crate::config::Config;
 use crate::light_field::build::{self as light_field_build, BuildSettings};
+use crate::media::writer::Content;
 use crate::pipeline::builder::Pipeline;
 use crate::pipeline::control::Controls;
 use crate::pipeline::live::Limits;
 use crate::pipeline::queue::Queue;
 use crate::pipeline::runner::RunningPipeline;
 use crate::progress::Progress;
-use crate::recording::folder::Recording;
 use crate::robot::feed::line::LineSource;
 use crate::robot::feed::reader::ArmFeed;
+use crate::sinks::display::Display;
 use crate::sinks::drift::{DriftReading, DriftSink};
 use crate::sinks::meter::{MeterReading, MeterSink};
-use crate::sinks::recorder::{RecorderReading, RecorderSettings, RecorderSink};
+use crate::sinks::recorder::{RecorderReading, RecorderSettings, RecorderSink, Track};
 use crate::sinks::trace::{TraceFormat, TraceSink};
+use crate::sinks::virtual_camera::{Screen, VirtualCameraReading, VirtualCameraSink};
 use crate::sources::camera::capture::CaptureWatch;
 use crate::sources::synthetic::Pace;
 use crate::stages::pose_stamping::Poses;
@@ -52,6 +54,12 @@ pub struct Plan<'a> {
     pub light_field: Option<&'a Path>,
     /// A folder to record into.
     pub record: Option<&'a Path>,
+    /// Record the enhanced picture too.
+    pub record_enhanced: bool,
+    /// The node of a virtual camera.
+    pub virtual_camera: Option<&'a Path>,
+    /// Where frames are laid to be shown.
+    pub display: Option<Display>,
     /// A file for the trace.
     pub trace: Option<&'a Path>,
     /// Single figures are kept of so many frames.
@@ -118,15 +126,16 @@ pub struct Session {
     pub drift: Option<DriftReading>,
     /// What is recorded.
     pub recorder: Option<RecorderReading>,
+    /// What is recorded of the enhanced picture.
+    pub enhanced_recorder: Option<RecorderReading>,
+    /// What other programs see.
+    pub virtual_camera: Option<VirtualCameraReading>,
     loader: Option<Loader>,
 }
 
 /// What the thread that reads the light field needs.
 struct Awaited {
-    config: Config,
-    recording: Recording,
-    poses: Option<Poses>,
-    size: (usize, usize),
+    door: LightFieldDoor,
     controls: Arc<Controls>,
     stop: Arc<AtomicBool>,
 }
@@ -138,26 +147,23 @@ impl Awaited {
             &BuildSettings::default(),
             &Quiet(&self.stop),
         )?);
-        let equipment = Equipment {
-            recording: &self.recording,
-            light_field: Some(Arc::clone(&light_field)),
-            light_field_to_come: false,
-            may_wait: false,
-            poses: self.poses,
-            size: self.size,
-        };
-        for stage in compose::light_field_stages(&self.config, &equipment, &light_field)? {
-            let name = stage.name();
-            self.controls.replace(stage)?;
+        let views = light_field.views.len();
+        self.door.bring(light_field);
+        for name in idle_stages(&self.controls) {
             self.controls.resume(name)?;
         }
         tracing::info!(
-            "light field: {} views from {}, in the line from now on",
-            light_field.views.len(),
+            "light field: {views} views from {}, in the line from now on",
             folder.display()
         );
         Ok(())
     }
+}
+
+/// Stages of the line that have nothing to do before there is a light field.
+fn idle_stages(controls: &Controls) -> Vec<&'static str> {
+    let idle = compose::idle_without_light_field();
+    controls.stages().filter(|name| idle.contains(name)).collect()
 }
 
 /// Shows nothing, and stops when the line does.
@@ -220,15 +226,22 @@ impl Session {
             light_field: None,
             light_field_to_come: plan.light_field.is_some(),
             may_wait: false,
-            poses: poses.clone(),
+            poses,
             size,
         };
-        let Line { stages, left_out, .. } = compose::line(config, plan.stages, &equipment)?;
+        let Line {
+            stages,
+            left_out,
+            light_field_door,
+            ..
+        } = compose::line(config, plan.stages, &equipment)?;
         let stage_names: Vec<&'static str> = stages.iter().map(|stage| stage.name()).collect();
-        let takes_light_field = stage_names.contains(&"pose_refinement");
 
         let limits = config.live.limits().for_period(period);
-        let mut builder = Pipeline::builder(source, Arc::clone(&clock)).between_stages(1);
+        let mut builder = Pipeline::builder(source, Arc::clone(&clock))
+            .between_stages(1)
+            .scheduling(&config.scheduling)
+            .keep_original(plan.display.is_some());
         if !plan.patient {
             builder = builder.live(limits).entry(Queue::newest_only());
         }
@@ -245,20 +258,48 @@ impl Session {
         let meter = MeterSink::new(Arc::clone(&clock), plan.keep);
         let reading = meter.reading();
         builder = builder.sink(Box::new(meter), door(2));
-        let mut recorder = None;
+        if let Some(display) = &plan.display {
+            builder = builder
+                .tap(Box::new(display.raw_sink()), door(1))
+                .sink(Box::new(display.sink()), door(1));
+        }
+        let (mut recorder, mut enhanced_recorder) = (None, None);
         if let Some(folder) = plan.record {
-            let sink = RecorderSink::new(
-                RecorderSettings {
-                    folder: folder.to_owned(),
-                    frame_rate_hz: if period > Span(0) { 1.0 / period.seconds() } else { 25.0 },
-                    beside: calibration_files(config, plan.wanted),
+            let raw = RecorderSettings {
+                track: Track::Raw,
+                content: if config.live.lossless_recording {
+                    Content::Lossless
+                } else {
+                    Content::Color
                 },
-                arm.as_ref().map(|_| samples),
-            )?;
+                folder: folder.to_owned(),
+                frame_rate_hz: if period > Span(0) { 1.0 / period.seconds() } else { 25.0 },
+                beside: calibration_files(config, plan.wanted),
+            };
+            let enhanced = RecorderSettings {
+                track: Track::Enhanced,
+                beside: Vec::new(),
+                ..raw.clone()
+            };
+            let sink = RecorderSink::new(raw, arm.as_ref().map(|_| samples))?;
             recorder = Some(sink.reading());
             builder = builder.tap(Box::new(sink), door(config.live.frames_before_recorder));
+            if plan.record_enhanced {
+                let sink = RecorderSink::new(enhanced, None)?;
+                enhanced_recorder = Some(sink.reading());
+                builder = builder.sink(Box::new(sink), door(config.live.frames_before_recorder));
+            }
             let table = TraceSink::new(&folder.join("timings.csv"), TraceFormat::Table, stage_names.clone())?;
             builder = builder.sink(Box::new(table), door(TRACED));
+        }
+        let mut virtual_camera = None;
+        if let Some(path) = plan.virtual_camera {
+            let sink = VirtualCameraSink::new(
+                virtual_camera_at(path)?,
+                config.virtual_camera.layout().map_err(anyhow::Error::msg)?,
+            );
+            virtual_camera = Some(sink.reading());
+            builder = builder.sink(Box::new(sink), door(1));
         }
         if let Some(path) = plan.trace {
             let trace = TraceSink::new(path, TraceFormat::Events, stage_names.clone())?;
@@ -272,18 +313,13 @@ impl Session {
             builder = builder.tap(Box::new(sink), door(1));
         }
         let line = builder.build()?.start()?;
-        for name in compose::waiting_stages() {
-            if takes_light_field && stage_names.contains(&name) {
-                line.controls().bypass(name)?;
-            }
-        }
-        let loader = match plan.light_field.filter(|_| takes_light_field) {
-            Some(folder) => {
+        let loader = match plan.light_field.zip(light_field_door) {
+            Some((folder, door)) => {
+                for name in idle_stages(line.controls()) {
+                    line.controls().bypass(name)?;
+                }
                 let awaited = Awaited {
-                    config: config.clone(),
-                    recording,
-                    poses,
-                    size,
+                    door,
                     controls: Arc::clone(line.controls()),
                     stop: Arc::clone(&stop),
                 };
@@ -304,6 +340,8 @@ impl Session {
             arm,
             drift,
             recorder,
+            enhanced_recorder,
+            virtual_camera,
             loader,
         })
     }
@@ -318,6 +356,20 @@ impl Session {
         self.stop.store(true, Ordering::Release);
         self.line.stop();
     }
+}
+
+/// The node behind which other programs find the picture.
+#[cfg(all(target_os = "linux", feature = "v4l2"))]
+fn virtual_camera_at(path: &Path) -> anyhow::Result<Box<dyn Screen>> {
+    Ok(Box::new(crate::sinks::v4l2_output::V4l2Output::new(path)))
+}
+
+#[cfg(not(all(target_os = "linux", feature = "v4l2")))]
+fn virtual_camera_at(path: &Path) -> anyhow::Result<Box<dyn Screen>> {
+    anyhow::bail!(
+        "{}: this program was built without virtual cameras (feature `v4l2`, Linux only)",
+        path.display()
+    )
 }
 
 impl Loader {

@@ -8,7 +8,9 @@ use crate::pipeline::runner::StageStatus;
 use crate::pipeline::seat::Condition;
 use crate::pipeline::timing::Summary;
 use crate::robot::feed::statistics::FeedStatus;
+use crate::sinks::meter::Coverage;
 use crate::sinks::recorder::Recorded;
+use crate::sinks::virtual_camera::VirtualCameraStatus;
 use crate::sources::camera::capture::CaptureStatus;
 use crate::time::{Span, Timestamp};
 
@@ -29,7 +31,10 @@ pub struct Snapshot {
     arm: Option<FeedStatus>,
     drift: Option<Verdict>,
     recorder: Option<Recorded>,
+    enhanced_recorder: Option<Recorded>,
+    virtual_camera: Option<VirtualCameraStatus>,
     light_field: LightFieldState,
+    coverage: Coverage,
 }
 
 /// Counts frames a second.
@@ -74,7 +79,10 @@ impl Snapshot {
             arm: session.arm.as_ref().map(|arm| arm.status()),
             drift: session.drift.as_ref().and_then(|drift| drift.get()),
             recorder: session.recorder.as_ref().map(|recorder| recorder.get()),
+            enhanced_recorder: session.enhanced_recorder.as_ref().map(|recorder| recorder.get()),
+            virtual_camera: session.virtual_camera.as_ref().map(|camera| camera.get()),
             light_field,
+            coverage: session.meter.coverage(),
         }
     }
 
@@ -97,6 +105,12 @@ impl Snapshot {
         }
         if self.light_field != LightFieldState::None {
             text += &format!(" · light field {}", self.light_field.word());
+            if let Some(share) = self.coverage.share().filter(|_| self.light_field == LightFieldState::Ready) {
+                text += &format!(", covers {:.0} %", 100.0 * share);
+            }
+        }
+        if let Some(camera) = self.virtual_camera.as_ref().filter(|camera| camera.failure.is_some()) {
+            text += &format!(" · NO VIRTUAL CAMERA, {} lost", camera.lost);
         }
         if let Some(recorder) = &self.recorder {
             text += &format!(" · recorded {}", recorder.frames);
@@ -159,7 +173,10 @@ impl Snapshot {
                 }),
             }),
             "light_field": self.light_field.word(),
+            "covered": self.coverage.share(),
             "recorder": self.recorder,
+            "enhanced_recorder": self.enhanced_recorder,
+            "virtual_camera": self.virtual_camera,
         })
     }
 }

@@ -110,12 +110,6 @@ impl StageWorker {
 
     fn treat(&mut self, seat: &Seat, frame: &mut Frame, state: &mut StageState) -> Passage {
         let switch = self.controls.switch(self.position);
-        if let Some(replacement) = switch.and_then(|switch| switch.take_replacement()) {
-            self.stage = replacement;
-            (state.broken, state.strength, state.last) = (false, None, None);
-            seat.set_broken(false);
-            tracing::debug!(stage = state.outcome.name, "the stage was exchanged for another of its name");
-        }
         if state.broken {
             return Passage::Bypassed;
         }
@@ -171,7 +165,7 @@ impl StageWorker {
                 );
                 state.outcome.panic = Some(message);
                 state.broken = true;
-                seat.set_broken(true);
+                seat.set_broken();
                 Passage::Bypassed
             }
         };

@@ -51,6 +51,11 @@ pub enum FeedError {
 pub struct SharedPoses(Arc<Mutex<PoseBuffer>>);
 
 impl SharedPoses {
+    /// Poses that somebody else fills in.
+    pub fn new(poses: PoseBuffer) -> Self {
+        Self(Arc::new(Mutex::new(poses)))
+    }
+
     /// Where the hand was at `instant`.
     pub fn pose_at(&self, instant: Timestamp) -> Result<StampedPose, PoseLookupError> {
         self.lock().pose_at(instant)
@@ -123,7 +128,7 @@ impl ArmFeed {
         tap: Option<Sender<Sample>>,
     ) -> Result<Self, FeedError> {
         settings.check().map_err(FeedError::Settings)?;
-        let poses = SharedPoses(Arc::new(Mutex::new(PoseBuffer::new(poses)?)));
+        let poses = SharedPoses::new(PoseBuffer::new(poses)?);
         let told = Arc::new(Mutex::new(Told {
             link: LinkState::Silent,
             since: clock.now(),

@@ -3,71 +3,8 @@
 use std::fmt;
 use std::time::Duration;
 
+use crate::media::layout::{Layout, Matrix, Range};
 use crate::time::{Span, Timestamp};
-
-/// How a camera lays out its pictures.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Layout {
-    /// Packed 4:2:2, Y first.
-    Yuyv,
-    /// Packed 4:2:2, U first.
-    Uyvy,
-    /// 4:2:0, a plane of Y, then one of U and V in turn.
-    Nv12,
-    /// A JPEG file for each frame.
-    Mjpeg,
-    /// Red, green, blue.
-    Rgb24,
-    /// Blue, green, red.
-    Bgr24,
-}
-
-impl Layout {
-    /// All of them, the best for us first: what needs least work, and keeps most color.
-    pub const ALL: [Self; 6] = [Self::Rgb24, Self::Bgr24, Self::Yuyv, Self::Uyvy, Self::Nv12, Self::Mjpeg];
-
-    /// Bytes of a row without padding, and rows of that length in a picture; `None` where that is not fixed.
-    pub fn rows(self, width: usize, height: usize) -> Option<(usize, usize)> {
-        match self {
-            Self::Yuyv | Self::Uyvy => Some((width.div_ceil(2) * 4, height)),
-            Self::Nv12 => Some((width, height + height.div_ceil(2))),
-            Self::Rgb24 | Self::Bgr24 => Some((3 * width, height)),
-            Self::Mjpeg => None,
-        }
-    }
-
-    /// As drivers name it.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Yuyv => "YUYV",
-            Self::Uyvy => "UYVY",
-            Self::Nv12 => "NV12",
-            Self::Mjpeg => "MJPG",
-            Self::Rgb24 => "RGB3",
-            Self::Bgr24 => "BGR3",
-        }
-    }
-}
-
-/// By which matrix colors were mixed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Matrix {
-    /// ITU-R BT.601.
-    Bt601,
-    /// ITU-R BT.709.
-    Bt709,
-    /// ITU-R BT.2020.
-    Bt2020,
-}
-
-/// Between which levels black and white lie.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Range {
-    /// 16 and 235.
-    Limited,
-    /// 0 and 255.
-    Full,
-}
 
 /// How a camera delivers.
 #[derive(Clone, Copy, Debug, PartialEq)]

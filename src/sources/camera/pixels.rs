@@ -6,7 +6,8 @@ use image::{DynamicImage, ImageFormat};
 use yuv::{YuvBiPlanarImage, YuvConversionMode, YuvPackedImage, YuvRange, YuvStandardMatrix};
 
 use crate::image::buffer::{Image, Rgb8};
-use crate::sources::camera::device::{Layout, Matrix, Mode, Range};
+use crate::media::layout::{Layout, Matrix, Range};
+use crate::sources::camera::device::Mode;
 
 /// Why bytes are no picture.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::sources::camera::device::{Layout, Wish};
+use crate::media::layout::Layout;
+use crate::sources::camera::device::Wish;
 
 /// Layouts as a user names them.
 const LAYOUTS: [(&str, Layout); 6] = [

@@ -19,15 +19,15 @@ use v4l::frameinterval::FrameIntervalEnum;
 use v4l::framesize::FrameSizeEnum;
 use v4l::io::mmap::Stream as Mapped;
 use v4l::io::traits::{CaptureStream as _, Stream as _};
-use v4l::v4l_sys::v4l2_input;
-use v4l::v4l2::ioctl;
-use v4l::v4l2::vidioc::{VIDIOC_ENUMINPUT, VIDIOC_G_INPUT};
 use v4l::video::Capture as _;
 use v4l::video::capture::Parameters;
 use v4l::{Format, FourCC, Fraction};
 
-use crate::sources::camera::device::{Camera, CameraError, Layout, Matrix, Mode, Range, Stamp, Stream, Wish};
+use crate::media::layout::{Layout, Matrix, Range};
+use crate::sources::camera::device::{Camera, CameraError, Mode, Stamp, Stream, Wish};
 use crate::time::Timestamp;
+use crate::video4linux::fourcc::{fourcc_of, layout_of};
+use crate::video4linux::signal;
 
 /// Buffers that the driver fills in turn: one is read, one is filled, two are in reserve.
 const BUFFERS: u32 = 4;
@@ -133,24 +133,6 @@ fn rate_of(interval: &Fraction) -> f64 {
     f64::from(interval.denominator) / f64::from(interval.numerator)
 }
 
-fn fourcc_of(layout: Layout) -> FourCC {
-    FourCC::new(match layout {
-        Layout::Yuyv => b"YUYV",
-        Layout::Uyvy => b"UYVY",
-        Layout::Nv12 => b"NV12",
-        Layout::Mjpeg => b"MJPG",
-        Layout::Rgb24 => b"RGB3",
-        Layout::Bgr24 => b"BGR3",
-    })
-}
-
-fn layout_of(fourcc: FourCC) -> Option<Layout> {
-    if fourcc == FourCC::new(b"JPEG") {
-        return Some(Layout::Mjpeg);
-    }
-    Layout::ALL.into_iter().find(|layout| fourcc_of(*layout) == fourcc)
-}
-
 /// A camera by its node, which is found again under another number.
 #[derive(Debug)]
 pub struct V4l2Camera {
@@ -246,6 +228,8 @@ struct V4l2Stream {
     mapped: Mapped<'static>,
     handle: Arc<Handle>,
     mode: Mode,
+    /// Whether the driver says when another signal comes in.
+    tells_changes: bool,
 }
 
 /// The layout to ask for: the one that is wished, or the best of those that are quick enough at the size.
@@ -281,8 +265,11 @@ fn chosen_layout(device: &Device, wish: &Wish, (width, height): (usize, usize)) 
 
 impl V4l2Stream {
     fn open(device: Device, wish: &Wish) -> Result<Self, OpenFault> {
+        // A capture card's size is its signal's; the wish holds for what can choose.
+        let of_signal = signal::follow(&device.handle());
         let present = device.format()?;
-        let (width, height) = wish.size.unwrap_or((present.width as usize, present.height as usize));
+        let present = (present.width as usize, present.height as usize);
+        let (width, height) = of_signal.or(wish.size).unwrap_or(present);
         let layout = chosen_layout(&device, wish, (width, height))?;
         let mut asked = Format::new(width as u32, height as u32, fourcc_of(layout));
         asked.field_order = FieldOrder::Progressive;
@@ -312,8 +299,14 @@ impl V4l2Stream {
                 queued => queued?,
             }
         }
+        let tells_changes = signal::tell_changes(&handle).is_ok();
         mapped.start()?;
-        Ok(Self { mapped, handle, mode })
+        Ok(Self {
+            mapped,
+            handle,
+            mode,
+            tells_changes,
+        })
     }
 }
 
@@ -371,27 +364,10 @@ impl Stream for V4l2Stream {
     }
 
     fn has_signal(&mut self) -> Option<bool> {
-        let status = input_status(&self.handle)?;
-        Some(status & (NO_POWER | NO_SIGNAL | NO_SYNC) == 0)
+        signal::is_there(&self.handle)
     }
-}
 
-/// Bits of an input's status (`V4L2_IN_ST_…`).
-const NO_POWER: u32 = 1;
-const NO_SIGNAL: u32 = 2;
-const NO_SYNC: u32 = 0x1_0000;
-
-/// What the driver says of the input that is read; `None` when it says nothing.
-fn input_status(handle: &Handle) -> Option<u32> {
-    let mut index: i32 = 0;
-    #[expect(unsafe_code, reason = "the crate has no call of its own for an input's status")]
-    // SAFETY: VIDIOC_G_INPUT writes one int, VIDIOC_ENUMINPUT reads and writes one `v4l2_input`; both live until the calls return, and
-    // all zeros are a valid `v4l2_input`.
-    unsafe {
-        ioctl(handle.fd(), VIDIOC_G_INPUT, (&raw mut index).cast()).ok()?;
-        let mut input: v4l2_input = std::mem::zeroed();
-        input.index = u32::try_from(index).ok()?;
-        ioctl(handle.fd(), VIDIOC_ENUMINPUT, (&raw mut input).cast()).ok()?;
-        Some(input.status)
+    fn wants_other_mode(&mut self) -> bool {
+        self.tells_changes && signal::has_changed(&self.handle)
     }
 }
