@@ -291,23 +291,40 @@ impl Theatre {
         }
     }
 
-    fn order(&mut self, stage: usize, order: Order) {
+    fn order(&self, stage: usize, order: Order) {
         *self.puppets[stage].order.lock().unwrap() = order;
+    }
+
+    /// Frames until the stage has done so: when time was short for one, it passed the stage by.
+    fn have_done(&mut self, stage: usize, order: Order) {
+        self.order(stage, order);
+        for _ in 0..1000 {
+            self.frame();
+            if *self.puppets[stage].order.lock().unwrap() == Order::Work {
+                return;
+            }
+        }
+        panic!("{} was given no frame", STAGES[stage]);
     }
 
     /// 200 ms in which a stage does not return: each frame comes out at its deadline as it came, then they go around the stage.
     fn stall(&mut self, stage: usize) {
         self.order(stage, Order::Stall);
-        let before = self.count();
-        self.acts.send(Act::Frame(0)).unwrap();
-        let began = MonotonicClock.now();
-        while self.puppets[stage].stalled.try_recv().is_err() {
-            assert!(
-                (MonotonicClock.now() - began).seconds() < PATIENCE_S,
-                "the stage was not given the frame"
-            );
-            std::thread::yield_now();
-        }
+        let before = loop {
+            let before = self.count();
+            self.acts.send(Act::Frame(0)).unwrap();
+            let mut stalled = false;
+            let began = MonotonicClock.now();
+            while !stalled && self.count() == before {
+                assert!((MonotonicClock.now() - began).seconds() < PATIENCE_S, "in vain for a frame");
+                stalled = self.puppets[stage].stalled.try_recv().is_ok();
+                std::thread::yield_now();
+            }
+            // Else the frame passed the stage by.
+            if stalled {
+                break before;
+            }
+        };
         for frame in 0..3 {
             let entered = self.clock.now();
             if frame > 0 {
@@ -347,20 +364,18 @@ fn inject(theatre: &mut Theatre, folder: &Path, random: &mut ChaCha8Rng) -> &'st
     match random.random_range(0..14) {
         0..=2 => {
             let stage = theatre.working_stage(random);
-            theatre.order(stage, Order::Fail);
-            theatre.frame();
+            theatre.have_done(stage, Order::Fail);
             "stage error"
         }
         3 => {
             let stage = theatre.working_stage(random);
             // The last one that is whole stays so.
             if theatre.puppets.iter().filter(|puppet| !puppet.broken).count() > 1 {
+                theatre.have_done(stage, Order::Panic);
                 theatre.puppets[stage].broken = true;
-                theatre.order(stage, Order::Panic);
             } else {
-                theatre.order(stage, Order::Fail);
+                theatre.have_done(stage, Order::Fail);
             }
-            theatre.frame();
             "stage panic"
         }
         4 | 5 => {

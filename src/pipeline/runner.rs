@@ -114,6 +114,7 @@ pub struct RunningPipeline {
     watchdog: Option<Watchdog>,
     clock: Arc<dyn Clock>,
     entry_drops: DropCount,
+    sink_drops: Vec<(&'static str, DropCount)>,
 }
 
 impl std::fmt::Debug for RunningPipeline {
@@ -127,6 +128,7 @@ impl std::fmt::Debug for RunningPipeline {
 /// Starts threads and keeps their handles; each holds an end of `ended` for as long as it lives.
 struct Crew {
     members: Vec<Member>,
+    sink_drops: Vec<(&'static str, DropCount)>,
     scheduling: Arc<Scheduling>,
     alive: channel::Sender<()>,
 }
@@ -174,6 +176,7 @@ impl Crew {
                 shared: Arc::clone(shared),
                 sink: door.sink,
             };
+            self.sink_drops.push((worker.sink.name(), sender.drop_count()));
             self.start(worker.sink.name(), None, move || worker.run())?;
             senders.push(sender);
         }
@@ -210,6 +213,7 @@ impl Pipeline {
         let (alive, ended) = channel::bounded(1);
         let mut crew = Crew {
             members: Vec::new(),
+            sink_drops: Vec::new(),
             scheduling: Arc::clone(&self.scheduling),
             alive,
         };
@@ -295,6 +299,7 @@ impl Pipeline {
             watchdog,
             clock,
             entry_drops,
+            sink_drops: crew.sink_drops,
         })
     }
 }
@@ -314,6 +319,12 @@ impl RunningPipeline {
             frames_dropped: self.entry_drops.get(),
             passed,
         }
+    }
+
+    /// Frames that the queue before a sink has dropped, because the sink was too slow.
+    pub fn dropped_before(&self, sink: &str) -> u64 {
+        let found = self.sink_drops.iter().find(|(name, _)| *name == sink);
+        found.map_or(0, |(_, drops)| drops.get())
     }
 
     /// From arrival to the end of the line, over the last frames.

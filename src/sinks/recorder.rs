@@ -29,7 +29,7 @@ const MOST_SAMPLES: usize = 10_000;
 pub struct Recorded {
     /// Frames written.
     pub frames: u64,
-    /// Frames that came and could not be written.
+    /// Frames that could not be written.
     pub lost: u64,
     /// Poses written.
     pub poses: u64,
@@ -64,6 +64,14 @@ pub enum Track {
 }
 
 impl Track {
+    /// Its recorder's name in the line.
+    pub fn sink_name(self) -> &'static str {
+        match self {
+            Self::Raw => "recorder",
+            Self::Enhanced => "enhanced recorder",
+        }
+    }
+
     fn files(self) -> [&'static str; 2] {
         match self {
             Self::Raw => ["video.mkv", "frames.csv"],
@@ -251,10 +259,7 @@ impl Part {
 
 impl Sink for RecorderSink {
     fn name(&self) -> &'static str {
-        match self.settings.track {
-            Track::Raw => "recorder",
-            Track::Enhanced => "enhanced recorder",
-        }
+        self.settings.track.sink_name()
     }
 
     fn consume(&mut self, frame: &Arc<Frame>) -> Result<(), SinkError> {

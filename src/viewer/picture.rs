@@ -221,9 +221,13 @@ mod tests {
 
     #[test]
     fn words_stand_below_and_wrap() {
-        let mut window = vec![0x00ff_ffff; 100 * 80];
-        words("one two three four", &mut window, (100, 80));
-        assert_eq!(window[0], 0x00ff_ffff);
-        assert!(window[(80 - 3 * LINE_PX) * 100..].contains(&0x00e6_e6e6));
+        // Five letters fit: four lines.
+        let mut window = vec![0x00ff_ffff; 100 * 120];
+        words("one two three four", &mut window, (100, 120));
+        let (above, below) = window.split_at((120 - 4 * LINE_PX) * 100);
+        assert!(above.iter().all(|pixel| *pixel == 0x00ff_ffff));
+        for line in below.chunks(LINE_PX * 100) {
+            assert!(line.contains(&0x00e6_e6e6) && line.contains(&0x003f_3f3f));
+        }
     }
 }

@@ -9,7 +9,7 @@ use crate::pipeline::seat::Condition;
 use crate::pipeline::timing::Summary;
 use crate::robot::feed::statistics::FeedStatus;
 use crate::sinks::meter::Coverage;
-use crate::sinks::recorder::Recorded;
+use crate::sinks::recorder::{Recorded, RecorderReading, Track};
 use crate::sinks::virtual_camera::VirtualCameraStatus;
 use crate::sources::camera::capture::CaptureStatus;
 use crate::time::{Span, Timestamp};
@@ -61,6 +61,13 @@ impl Rate {
     }
 }
 
+/// What is recorded; lost is as well what a recorder was too slow for.
+fn recorded(session: &Session, reading: Option<&RecorderReading>, track: Track) -> Option<Recorded> {
+    let mut recorded = reading?.get();
+    recorded.lost += session.line.dropped_before(track.sink_name());
+    Some(recorded)
+}
+
 impl Snapshot {
     /// Look at everything.
     pub fn of(session: &mut Session, rate: &mut Rate, now: Timestamp) -> Self {
@@ -78,8 +85,8 @@ impl Snapshot {
             camera: session.camera.as_ref().map(|camera| camera.status()),
             arm: session.arm.as_ref().map(|arm| arm.status()),
             drift: session.drift.as_ref().and_then(|drift| drift.get()),
-            recorder: session.recorder.as_ref().map(|recorder| recorder.get()),
-            enhanced_recorder: session.enhanced_recorder.as_ref().map(|recorder| recorder.get()),
+            recorder: recorded(session, session.recorder.as_ref(), Track::Raw),
+            enhanced_recorder: recorded(session, session.enhanced_recorder.as_ref(), Track::Enhanced),
             virtual_camera: session.virtual_camera.as_ref().map(|camera| camera.get()),
             light_field,
             coverage: session.meter.coverage(),
