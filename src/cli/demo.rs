@@ -89,7 +89,12 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     tracing::info!("2 of 4: building the light field from the survey");
     let began = MonotonicClock.now();
     let light_field_folder = folder.join("light_field");
-    let (light_field, _) = light_field::built(&simulation.join("survey"), VIEWS, true, &context.config, &context.console)
+    let wanted = light_field::Wanted {
+        views: VIEWS,
+        refine: true,
+        telescope_angle_deg: None,
+    };
+    let (light_field, _) = light_field::built(&simulation.join("survey"), wanted, &context.config, &context.console)
         .context("building the light field")?;
     light_field_file::save(&light_field, &light_field_folder, &context.console)?;
     drop(light_field);
@@ -111,6 +116,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         report: None,
         start: None,
         end: None,
+        telescope_angle_deg: None,
     };
     let enhanced = process(&whole, context, Vec::new()).context("enhancing the live recording")?;
     parts.whole_line_s = since(began);

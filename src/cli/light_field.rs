@@ -10,6 +10,7 @@ use serde::Serialize;
 
 use crate::camera::file as camera_file;
 use crate::cli::import;
+use crate::cli::telescope;
 use crate::config::Config;
 use crate::geometry::space::{Camera, World};
 use crate::geometry::transform::Transform;
@@ -78,6 +79,9 @@ struct BuildArgs {
     /// Trust the poses as they are: no refinement by the pictures.
     #[arg(long)]
     no_refinement: bool,
+    /// How far an oblique telescope is turned against the camera head in this recording, degrees (`calibrate oblique` tells what turns).
+    #[arg(long, value_name = "DEG", allow_negative_numbers = true)]
+    telescope_angle_deg: Option<f64>,
 }
 
 #[derive(Debug, clap::Args)]
@@ -161,25 +165,43 @@ impl PosePrior for Arm {
     }
 }
 
+/// What is asked of a light field that is built from a survey.
+#[derive(Clone, Copy, Debug)]
+pub struct Wanted {
+    /// Views.
+    pub views: usize,
+    /// Whether the pictures refine the arm's poses.
+    pub refine: bool,
+    /// How far an oblique telescope is turned.
+    pub telescope_angle_deg: Option<f64>,
+}
+
 /// Builds a light field from a survey recording or a COLMAP model in `source`, without writing it.
 pub fn built(
     source: &Path,
-    views: usize,
-    refine: bool,
+    wanted: Wanted,
     config: &Config,
     progress: &dyn Progress,
 ) -> anyhow::Result<(LightField, serde_json::Value)> {
     let (light_field, report) = if model_folder(source).is_some() && !source.join("poses.tum").is_file() {
+        if wanted.telescope_angle_deg.is_some() {
+            bail!("--telescope-angle-deg is of recordings: the cameras of a COLMAP model are as they were turned");
+        }
         from_model(source, progress)?
     } else {
-        from_recording(source, views, refine, config, progress)?
+        from_recording(source, wanted, config, progress)?
     };
     Ok((light_field, serde_json::to_value(report)?))
 }
 
 fn build_command(args: &BuildArgs, config: &Config, force: bool, progress: &dyn Progress) -> anyhow::Result<()> {
     refuse_overwriting(&args.output, force)?;
-    let (light_field, mut report) = built(&args.recording, args.views, !args.no_refinement, config, progress)?;
+    let wanted = Wanted {
+        views: args.views,
+        refine: !args.no_refinement,
+        telescope_angle_deg: args.telescope_angle_deg,
+    };
+    let (light_field, mut report) = built(&args.recording, wanted, config, progress)?;
     let began = MonotonicClock.now();
     file::save(&light_field, &args.output, progress)?;
     report["seconds"]["write_s"] = since(began).into();
@@ -220,12 +242,12 @@ fn from_model(source: &Path, progress: &dyn Progress) -> anyhow::Result<(LightFi
 
 fn from_recording(
     source: &Path,
-    views: usize,
-    refine: bool,
+    wanted: Wanted,
     config: &Config,
     progress: &dyn Progress,
 ) -> anyhow::Result<(LightField, BuildReport)> {
-    let recording = Recording::open(source)?;
+    let Wanted { views, refine, .. } = wanted;
+    let recording = telescope::turned(Recording::open(source)?, wanted.telescope_angle_deg)?;
     let what = "a light field needs camera.yaml, poses.tum (or joints.csv) and hand_eye.yaml beside the video";
     let (Some(camera), Some(trajectory), Some(hand_eye)) = (&recording.camera, &recording.trajectory, &recording.hand_eye) else {
         let missing: Vec<String> = recording.missing().iter().map(ToString::to_string).collect();

@@ -15,6 +15,7 @@ pub mod outputs;
 pub mod process;
 pub mod report;
 pub mod simulate;
+pub mod telescope;
 
 use std::ffi::OsString;
 use std::process::ExitCode;

@@ -11,6 +11,7 @@ use crate::camera::model::CameraModel;
 use crate::cli::context::{Context, Ended, UsageError};
 use crate::cli::outputs::{Outputs, beside};
 use crate::cli::report::Report;
+use crate::cli::telescope;
 use crate::compose::{self, Choice, Equipment, Line};
 use crate::config::Config;
 use crate::frame::PoseOrigin;
@@ -70,6 +71,9 @@ pub struct Args {
     /// End here, s.
     #[arg(long, value_name = "S")]
     pub end: Option<f64>,
+    /// How far an oblique telescope is turned against the camera head in this recording, degrees (`calibrate oblique` tells what turns).
+    #[arg(long, value_name = "DEG", allow_negative_numbers = true)]
+    pub telescope_angle_deg: Option<f64>,
 }
 
 /// The image field is looked for in so many frames …
@@ -106,7 +110,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
 pub fn process(args: &Args, context: &Context, extra: Vec<Box<dyn Sink>>) -> anyhow::Result<Processed> {
     let span = TimeSpan::checked(args)?;
     let output = Output::from_argument(&args.output).map_err(|error| UsageError(error.to_string()))?;
-    let recording = open_recording(&args.input)?;
+    let recording = telescope::turned(open_recording(&args.input)?, args.telescope_angle_deg)?;
     let input = if args.input == Path::new("-") {
         Input::Y4mStdin
     } else {
@@ -358,7 +362,7 @@ fn write_camera(camera: &CameraModel, args: &Args, recording: &Recording, contex
             return Ok(());
         }
         // A recording's own calibration is never written over, even with --force.
-        let own = recording.camera.as_ref() == Some(&present);
+        let own = recording.camera.as_ref() == Some(&present) || matches!(camera_file::read_oblique(&path), Ok(Some(_)));
         if own || !context.force {
             let stem = args
                 .output

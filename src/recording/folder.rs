@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use crate::camera::file::{self as camera_file, CameraFileError};
 use crate::camera::model::CameraModel;
+use crate::camera::oblique::Oblique;
 use crate::recording::frame_times::{self, FrameTimeFault};
 use crate::robot::hand_eye::{HandEye, HandEyeError};
 use crate::robot::kinematics::{Arm, ArmError};
@@ -81,6 +82,8 @@ pub struct Recording {
     pub hand_eye: Option<HandEye>,
     /// Explains the pixels.
     pub camera: Option<CameraModel>,
+    /// How an oblique scope's telescope turns against the camera head; camera and hand-eye are those of angle 0.
+    pub oblique: Option<Oblique>,
     /// `color.yaml`, for the color stage to read.
     pub color: Option<PathBuf>,
 }
@@ -134,6 +137,11 @@ pub enum RecordingError {
         /// What.
         fault: FrameTimeFault,
     },
+    /// An angle, but nothing that turns.
+    #[error(
+        "an angle of the telescope is given, but camera.yaml has no block `oblique` that says how it turns: `endofield calibrate oblique` makes it"
+    )]
+    NoTelescope,
     /// The camera was calibrated with pictures of another size.
     #[error(
         "camera.yaml is for pictures of {camera_width}x{camera_height}, the video has {video_width}x{video_height}: \
@@ -160,6 +168,7 @@ impl Recording {
             trajectory: None,
             hand_eye: None,
             camera: None,
+            oblique: None,
             color: None,
         }
     }
@@ -183,7 +192,23 @@ impl Recording {
             trajectory: trajectory_in(path)?,
             hand_eye: there("hand_eye.yaml").map(|file| HandEye::read(&file)).transpose()?,
             camera: there("camera.yaml").map(|file| camera_file::read(&file)).transpose()?,
+            oblique: there("camera.yaml")
+                .map(|file| camera_file::read_oblique(&file))
+                .transpose()?
+                .flatten(),
             color: there("color.yaml"),
+        })
+    }
+
+    /// The recording as taken with the telescope turned by this angle: camera and hand-eye are brought there from angle 0.
+    pub fn with_telescope_at(self, angle_rad: f64) -> Result<Self, RecordingError> {
+        let (Some(camera), Some(oblique)) = (&self.camera, &self.oblique) else {
+            return Err(RecordingError::NoTelescope);
+        };
+        Ok(Self {
+            camera: Some(oblique.camera_at(camera, angle_rad)),
+            hand_eye: (self.hand_eye.as_ref()).map(|hand_eye| hand_eye.with_camera_moved(&oblique.turned_from_zero(angle_rad))),
+            ..self
         })
     }
 
@@ -316,6 +341,36 @@ mod tests {
         let missing: Vec<Part> = recording.missing().iter().map(|m| m.what).collect();
         assert_eq!(missing, [Part::Camera, Part::Poses]);
         assert!(recording.check_video_size(1, 1).is_ok());
+    }
+
+    #[test]
+    fn a_telescope_is_turned_where_its_joint_is_known() {
+        let folder = tempfile::tempdir().unwrap();
+        let put = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+        put("video.mkv", "x");
+        put("camera.yaml", CAMERA);
+        put(
+            "hand_eye.yaml",
+            "unit: mm\ntranslation: {x: 1, y: 2, z: 3}\nrotation: {x: 0, y: 0, z: 0, w: 1}\n",
+        );
+        let straight = Recording::open(folder.path()).unwrap();
+        let refusal = straight.with_telescope_at(0.5).unwrap_err().to_string();
+        assert!(refusal.contains("calibrate oblique"), "{refusal}");
+
+        let joint = "oblique:\n  axis: [0, 0.5, 0.866]\n  point_mm: [0, 0, 0]\n  center_px: [30, 25]\n";
+        put("camera.yaml", &format!("{CAMERA}{joint}"));
+        let at_zero = Recording::open(folder.path()).unwrap();
+        let turned = at_zero.clone().with_telescope_at(std::f64::consts::FRAC_PI_2).unwrap();
+        let [from, to] = [&at_zero, &turned].map(|recording| recording.camera.as_ref().unwrap().intrinsics);
+        // A quarter turn, right to down, about (30, 25).
+        assert!((to.cx - (30.0 - (from.cy - 25.0))).abs() < 1e-9 && (to.cy - (25.0 + (from.cx - 30.0))).abs() < 1e-9);
+        // The axis goes through the camera: it stays where it is and looks elsewhere, as far from the axis as before.
+        let [from, to] = [&at_zero, &turned].map(|recording| recording.hand_eye.as_ref().unwrap().hand_from_camera);
+        assert!((from.translation() - to.translation()).norm() < 1e-9);
+        let axis = nalgebra::Vector3::new(0.0, 0.5, 0.866).normalize();
+        let forward = nalgebra::Vector3::z();
+        let [before, after] = [from, to].map(|pose| (pose.rotation() * forward).dot(&axis));
+        assert!((before - after).abs() < 1e-9 && (from.rotation() * forward - to.rotation() * forward).norm() > 0.6);
     }
 
     #[test]

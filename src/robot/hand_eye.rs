@@ -108,6 +108,25 @@ impl HandEye {
         }
     }
 
+    /// The same for a camera that was moved on the hand: its place comes from the old one's by `moved_from_camera`.
+    ///
+    /// An error of rotation swings the new place about the old one, so the covariance of the place changes with the distance.
+    pub fn with_camera_moved(&self, moved_from_camera: &Transform<Camera, Camera>) -> Self {
+        let hand_from_moved = self.hand_from_camera * moved_from_camera.inverse();
+        let shift = hand_from_moved.translation() - self.hand_from_camera.translation();
+        let covariance = self.covariance.map(|covariance| {
+            let mut change = Matrix6::identity();
+            change.fixed_view_mut::<3, 3>(0, 3).copy_from(&-shift.cross_matrix());
+            change * covariance * change.transpose()
+        });
+        Self {
+            hand_from_camera: hand_from_moved,
+            covariance,
+            time_offset: self.time_offset,
+            report: self.report.clone(),
+        }
+    }
+
     /// Read `hand_eye.yaml`.
     pub fn read(path: &Path) -> Result<Self, HandEyeError> {
         let text = std::fs::read_to_string(path).map_err(|source| HandEyeError::Unreadable {
@@ -267,6 +286,38 @@ mod tests {
     }
 
     const LONG: &str = "unit: mm\ntranslation: {x: 1.5, y: -2, z: 300}\nrotation: {x: 0, y: 0, z: 0.6, w: 0.8}\n";
+
+    #[test]
+    fn a_moved_camera_takes_its_deviations_with_it() {
+        use nalgebra::{UnitQuaternion, Vector3, Vector6};
+        let about = |x, y, z| UnitQuaternion::from_scaled_axis(Vector3::new(x, y, z));
+        let moved_from_camera = Transform::new(about(0.1, 0.4, -0.2), Vector3::new(3.0, -20.0, 7.0));
+        let truth = Transform::new(about(1.0, -0.3, 0.2), Vector3::new(10.0, 20.0, 300.0));
+        // The place errs by (dt, dr) in the hand's space: small enough that squares do not count.
+        let erring = |error: Vector6<f64>| {
+            let turn = UnitQuaternion::from_scaled_axis(error.fixed_rows::<3>(3).into_owned());
+            let place = truth.translation() + error.fixed_rows::<3>(0);
+            HandEye::new(Transform::new(turn * truth.rotation(), place)).with_camera_moved(&moved_from_camera)
+        };
+        let exact = erring(Vector6::zeros()).hand_from_camera;
+        let mut expected = Matrix6::zeros();
+        let deviations = [0.3, 0.1, 0.2, 0.01, 0.02, 0.005];
+        for (place, deviation) in deviations.into_iter().enumerate() {
+            let mut error = Vector6::zeros();
+            error[place] = 1e-6 * deviation;
+            let off = erring(error).hand_from_camera;
+            let shift = (off.translation() - exact.translation()) / 1e-6;
+            let turn = (off.rotation() * exact.rotation().inverse()).scaled_axis() / 1e-6;
+            let column = Vector6::new(shift.x, shift.y, shift.z, turn.x, turn.y, turn.z);
+            expected += column * column.transpose();
+        }
+        let stated = HandEye {
+            covariance: Some(Matrix6::from_diagonal(&Vector6::from(deviations.map(|d| d * d)))),
+            ..HandEye::new(truth)
+        };
+        let found = stated.with_camera_moved(&moved_from_camera).covariance.unwrap();
+        assert!((found - expected).amax() < 1e-5, "{found} {expected}");
+    }
 
     #[test]
     fn both_forms_and_units_agree() {

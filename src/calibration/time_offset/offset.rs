@@ -34,6 +34,9 @@ const PARTS: usize = 3;
 const INPUTS: usize = 7;
 /// With fewer independent windows the linear function bends to whatever the camera did: some ten seconds are wanted.
 const SURE_WINDOWS: f64 = 50.0;
+/// Overlapping windows may be independent in what they err, but not in how the hand moved: in less time than this it has moved in too few
+/// ways, s.
+const SURE_S: f64 = 6.0;
 /// Fewer windows than this that do not overlap tell nothing.
 const LEAST_WINDOWS: f64 = 12.0;
 
@@ -61,6 +64,8 @@ pub struct Offset {
     pub distinctness: f64,
     /// Length of the windows, s, and how many of them are independent.
     pub windows: [f64; 2],
+    /// From the first window's begin to the last one's end, s.
+    pub seconds: f64,
     /// Offsets tried (ms) and the logarithms of their likelihoods.
     pub curve: Vec<[f64; 2]>,
     /// Seconds since the first picture, and the number that is explained best, per window: of the picture, and by the arm.
@@ -70,7 +75,11 @@ pub struct Offset {
 impl Offset {
     /// Whether it may be relied on.
     pub fn is_sure(&self) -> bool {
-        self.sigma_ms < 20.0 && self.explained > 0.3 && self.distinctness > 3.0 && self.windows[1] > SURE_WINDOWS
+        self.sigma_ms < 20.0
+            && self.explained > 0.3
+            && self.distinctness > 3.0
+            && self.windows[1] > SURE_WINDOWS
+            && self.seconds > SURE_S
     }
 }
 
@@ -189,6 +198,10 @@ fn estimate_over(window_s: f64, motions: &[TimedMotion], arm: &Path, about: Span
         explained: at_best.explained,
         distinctness: likelihood(&at_best) - rival,
         windows: [window_s, count],
+        seconds: windows
+            .first()
+            .zip(windows.last())
+            .map_or(0.0, |(first, last)| (last.to - first.from).seconds()),
         curve: coarse.iter().map(|(ms, fit)| [*ms, likelihood(fit)]).collect(),
         traces: traces(&windows, arm, offset_ms, &at_best),
     })
@@ -492,6 +505,10 @@ pub(super) mod tests {
         assert!(unsure(estimate(&motions, &other, Span(0), Span::from_milliseconds(300.0))));
         let short = estimate(&motions[..30], &other, Span(0), Span::from_milliseconds(300.0));
         assert!(matches!(short, Err(OffsetError::TooShort { .. })), "{short:?}");
+        // Rightly or not, but four seconds are not enough to know.
+        let (motions, arm) = wandering(8, 4.0, 50.0, |_| 40.0);
+        let brief = estimate(&motions, &arm, Span(0), Span::from_milliseconds(300.0));
+        assert!(unsure(brief.clone()), "{brief:?}");
         let (motions, arm) = wandering(7, 12.0, 25.0, |_| 180.0);
         let narrow = estimate(&motions, &arm, Span(0), Span::from_milliseconds(150.0));
         assert!(matches!(narrow, Err(OffsetError::AtTheEnd { .. })), "{narrow:?}");

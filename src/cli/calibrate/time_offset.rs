@@ -13,6 +13,7 @@ use crate::cli::calibrate::camera_path::{CORNERS, Corners, HARDLY, Stretches, Tr
 use crate::cli::calibrate::time_offset_report::{Found, Report, StretchReport};
 use crate::cli::console;
 use crate::cli::context::{Context, Ended};
+use crate::cli::telescope;
 use crate::image::pool::Pool;
 use crate::media::image_files;
 use crate::media::reader::{Input, VideoReader};
@@ -51,6 +52,9 @@ pub struct Args {
     /// Draw likelihood and motion here, as PNG.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
+    /// How far an oblique telescope is turned against the camera head in this recording, degrees (`calibrate oblique` tells what turns).
+    #[arg(long, value_name = "DEG", allow_negative_numbers = true)]
+    telescope_angle_deg: Option<f64>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -77,7 +81,8 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
             args.range_ms
         )));
     }
-    let recording = Recording::open(&args.recording)?;
+    let untouched = Recording::open(&args.recording)?;
+    let recording = telescope::turned(untouched.clone(), args.telescope_angle_deg)?;
     let trajectory = recording
         .trajectory
         .as_ref()
@@ -117,7 +122,7 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         anyhow::bail!("not observed: {}", report.advice);
     };
     if args.write {
-        write(&args.recording, &recording, Span::from_milliseconds(offset_ms))?;
+        write(&args.recording, &untouched, Span::from_milliseconds(offset_ms))?;
     }
     Ok(Ended::Complete)
 }
