@@ -44,6 +44,20 @@ pub fn srgb_from_linear(linear: f64) -> f64 {
     }
 }
 
+/// [`linear_from_srgb`] within 0.002: a cubic, for pixels by the thousand.
+#[inline(always)]
+pub fn fast_linear(encoded: f32) -> f32 {
+    encoded * (0.012_522_878 + encoded * (0.682_171_1 + encoded * 0.305_306_02))
+}
+
+/// [`srgb_from_linear`] within 0.005: square roots of square roots.
+#[inline(always)]
+pub fn fast_srgb(linear: f32) -> f32 {
+    let half = linear.sqrt();
+    let fourth = half.sqrt();
+    (0.662_002_7 * half + 0.684_122_06 * fourth - 0.323_583_6 * fourth.sqrt() - 0.022_541_147 * linear).max(0.0)
+}
+
 /// CIE XYZ (Y = 1 for white) from 8-bit sRGB.
 pub fn xyz_from_srgb8(color: Rgb8) -> [f64; 3] {
     xyz_from_linear(color.map(|v| linear_from_srgb(f64::from(v) / 255.0)))
@@ -217,6 +231,21 @@ mod tests {
                 let linear = linear_from_xyz(xyz)[i];
                 assert!((linear - linear_from_srgb(f64::from(color[i]) / 255.0)).abs() < 1e-5);
             }
+        }
+    }
+
+    #[test]
+    fn the_fast_curves_keep_to_the_exact_ones() {
+        for level in 0..=255 {
+            let exact = f64::from(level) / 255.0;
+            assert!(
+                (f64::from(fast_linear(exact as f32)) - linear_from_srgb(exact)).abs() < 0.002,
+                "{level}"
+            );
+            assert!(
+                (f64::from(fast_srgb(exact as f32)) - srgb_from_linear(exact)).abs() < 0.005,
+                "{level}"
+            );
         }
     }
 

@@ -25,6 +25,12 @@ const HAZE_REACH_PX: f32 = 20.0;
 const FEWEST_ANSWERS: usize = 4;
 /// Up to this share of white light may be noise.
 const CLEAN_TO: f32 = 0.015;
+/// The most confidence where the views do not agree on what is darkest: perhaps no view saw it clean.
+const TRUST_UNSURE: f32 = 0.1;
+/// They do not agree where less than this share of what lies around agrees: a few will by chance.
+const SURE_SHARE: f32 = 0.75;
+/// Squares around one that is judged.
+const SURE_REACH: usize = 2;
 /// A pixel with this share of white light speaks where nobody else does, with `HAZY` confidence.
 const HAZE: f32 = 0.05;
 /// Confidence in a pixel under haze.
@@ -38,6 +44,8 @@ const LAMP_ONLY: f32 = 1.5;
 /// A pixel lit this much worse than the lamp explains shows something else: steel, a shadow, the surround (shrunk by the prior: a third
 /// of the light is missing).
 const DARKER: f32 = 0.15;
+/// From this level on, in all channels, a pixel says no colour.
+const CLIPPED: u8 = 245;
 /// Below this share noise is averaged away; above it edges are kept.
 const FAINT: f32 = 0.08;
 /// Added to both sides, levels: in the dark ratios are noise.
@@ -71,6 +79,11 @@ const SOMETHING_ELSE: f32 = f32::INFINITY;
 /// Nothing is known of this square.
 const UNKNOWN: f32 = f32::NAN;
 
+/// The views agree on a square, do not, or were not asked.
+const SURE: u8 = 1;
+const UNSURE: u8 = 2;
+const UNASKED: u8 = 0;
+
 fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), index: usize, filler: &mut HoleFiller) -> Mask {
     let view = &light_field.views[index];
     let (width, height) = view.image.size();
@@ -83,6 +96,7 @@ fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), 
         .collect();
     let (across, down) = (width / STEP, height / STEP);
     let mut shares = Image::filled(across, down, UNKNOWN);
+    let mut sure = Image::filled(across, down, UNASKED);
     let mut tissue = Tissue::default();
     for row in 0..down {
         for column in 0..across {
@@ -95,8 +109,10 @@ fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), 
             let middle = 0.5 * (STEP as f32 - 1.0);
             let place = (x as f32 + middle, y as f32 + middle);
             for witness in &witnesses {
-                if let Some(answer) = witness.color(place.0, place.1, z) {
-                    tissue.hear(answer);
+                match witness.color(place.0, place.1, z) {
+                    Some(Answer::Color(color)) => tissue.hear(color),
+                    Some(Answer::Clipped) => tissue.hear_clipped(),
+                    None => {}
                 }
             }
             if tissue.answers() < FEWEST_ANSWERS {
@@ -105,11 +121,13 @@ fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), 
             let own = shades[index].common(mean_color(view, x, y), x, y);
             // The pixel is a witness too: with two that agree it need not be outvoted by a dazzled crowd.
             tissue.hear(own);
-            let found = difference(own, tissue.color());
+            let verdict = tissue.judge();
+            let found = difference(own, verdict.color);
             shares.set(column, row, if found.lit < -DARKER { SOMETHING_ELSE } else { found.lamp });
+            sure.set(column, row, if verdict.is_sure { SURE } else { UNSURE });
         }
     }
-    let smooth = averaged(&shares);
+    let (smooth, most) = (averaged(&shares), most_trust(&sure));
     let mut confidence = view.confidence.clone();
     for y in 0..down * STEP {
         for x in 0..across * STEP {
@@ -118,8 +136,12 @@ fn examined(light_field: &LightField, (shades, surrounds): (&[Shade], &[Mask]), 
                 continue;
             }
             // A clipped pixel tells nothing whatever the others say.
-            let clipped = view.image.at(x, y).iter().all(|&c| c >= 250);
-            let settled = if clipped { 0 } else { (254.0 * trust_in(share)).ceil() as u8 };
+            let clipped = is_clipped(view.image.at(x, y));
+            let settled = if clipped {
+                0
+            } else {
+                (254.0 * trust_in(share).min(most.at(x / STEP, y / STEP))).ceil() as u8
+            };
             // What no detector doubted and is darker than expected is no lamp: an edge, seen from elsewhere.
             if view.confidence.at(x, y) < 255 || share > CLEAN_TO && share != SOMETHING_ELSE {
                 confidence.set(x, y, settled);
@@ -193,6 +215,30 @@ fn averaged(shares: &Image<f32>) -> Image<f32> {
                 }
             }
             out.set(x, y, sum / count);
+        }
+    }
+    out
+}
+
+/// The most confidence in each square, by whether the views agree there and around it.
+fn most_trust(sure: &Image<u8>) -> Image<f32> {
+    let (width, height) = sure.size();
+    let mut out = Image::filled(width, height, 1.0);
+    for y in 0..height {
+        for x in 0..width {
+            if sure.at(x, y) == UNASKED {
+                continue;
+            }
+            let (mut agree, mut asked) = (0.0_f32, 0.0_f32);
+            for v in y.saturating_sub(SURE_REACH)..(y + SURE_REACH + 1).min(height) {
+                for &one in &sure.row(v)[x.saturating_sub(SURE_REACH)..(x + SURE_REACH + 1).min(width)] {
+                    agree += if one == SURE { 1.0 } else { 0.0 };
+                    asked += if one == UNASKED { 0.0 } else { 1.0 };
+                }
+            }
+            if agree < SURE_SHARE * asked {
+                out.set(x, y, TRUST_UNSURE);
+            }
         }
     }
     out
@@ -273,6 +319,18 @@ impl Shade {
     }
 }
 
+/// White, and whatever was there is not known.
+fn is_clipped(pixel: Rgb8) -> bool {
+    pixel.iter().all(|&level| level >= CLIPPED)
+}
+
+/// What a witness says.
+enum Answer {
+    /// With its exposure and lamp undone.
+    Color([f32; 3]),
+    Clipped,
+}
+
 struct Witness<'a> {
     view: &'a View,
     shade: &'a Shade,
@@ -291,16 +349,23 @@ impl<'a> Witness<'a> {
         })
     }
 
-    /// The common colour of what this view shows where (x, y) at depth z lies; `None` if it does not see that.
-    fn color(&self, x: f32, y: f32, z: f32) -> Option<[f32; 3]> {
+    /// What this view shows where (x, y) at depth z lies; `None` if it does not see that.
+    fn color(&self, x: f32, y: f32, z: f32) -> Option<Answer> {
         let (u, v, depth) = self.mapping.apply(x, y, z);
         let (width, height) = self.view.image.size();
         if !(u >= 0.0 && v >= 0.0 && u < width as f32 - 1.0 && v < height as f32 - 1.0) {
             return None;
         }
         let (column, row) = ((u + 0.5) as usize, (v + 0.5) as usize);
-        (self.surround.at(column, row) == 0 && is_unoccluded(self.view.depth.at(column, row), depth))
-            .then(|| self.shade.common(self.view.image.at(column, row).map(f32::from), column, row))
+        if self.surround.at(column, row) != 0 || !is_unoccluded(self.view.depth.at(column, row), depth) {
+            return None;
+        }
+        let pixel = self.view.image.at(column, row);
+        Some(if is_clipped(pixel) {
+            Answer::Clipped
+        } else {
+            Answer::Color(self.shade.common(pixel.map(f32::from), column, row))
+        })
     }
 }
 
@@ -328,6 +393,19 @@ mod tests {
             assert!(mask.row(y)[..99 + reach].iter().all(|&m| m == 255));
             assert!(mask.row(y)[101 + reach..].iter().all(|&m| m == 0));
         }
+    }
+
+    #[test]
+    fn a_lone_square_that_agrees_by_chance_is_not_trusted() {
+        let mut sure = Image::filled(20, 20, SURE);
+        for y in 4..16 {
+            sure.row_mut(y)[4..16].fill(UNSURE);
+        }
+        sure.set(10, 10, SURE);
+        sure.set(0, 19, UNASKED);
+        let trust = most_trust(&sure);
+        assert!(trust.at(10, 10) == TRUST_UNSURE && trust.at(5, 5) == TRUST_UNSURE);
+        assert!(trust.at(1, 1) == 1.0 && trust.at(0, 19) == 1.0);
     }
 
     #[test]

@@ -9,6 +9,7 @@ use crate::light_field::lamp_share::difference;
 use crate::stages::specularity_substitution::drawing::Bench;
 use crate::stages::specularity_substitution::grid::{CELLS_PER_BLOCK, Grid, Sums};
 use crate::stages::specularity_substitution::live::{DARK_LEVELS, Live};
+use crate::stages::specularity_substitution::residual_lamp::{doubt_of, without_lamp};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::speaker::Chosen;
 use crate::stages::specularity_substitution::spots::Spot;
@@ -34,7 +35,8 @@ const RESIDUAL_WEIGHT: f32 = 3.0;
 
 /// Tissue looks the same to most views; steel, a mirror, to none. Where less than this share of the votes agrees …
 const USUAL_AGREEMENT: f32 = 0.7;
-/// … so much more evidence is wanted, all of it where none does, levels.
+/// … so much more evidence is wanted, all of it where none does, levels; less where none is known to have seen it clean, for the lamp's
+/// light differs from view to view.
 const DISAGREEMENT_LEVELS: f32 = 90.0;
 
 /// Tissue is not darker than this share of what lies around it; the gap behind an organ's edge is.
@@ -44,6 +46,12 @@ const DARKEST_SHARE: f32 = 0.5;
 fn usual(scene: &Scene<'_>, brightness: &[Sums], spot: Spot) -> f32 {
     let sums = brightness[scene.grid.block_at(spot.x.into(), spot.y.into())];
     (sums[1] / sums[0].max(1e-6) - DARK_LEVELS).max(0.0)
+}
+
+/// The mean colour of the good pixels around a spot, levels.
+fn usual_color(scene: &Scene<'_>, live: &Live, spot: Spot) -> [f32; 3] {
+    let sums = scene.grid.between(&live.detail, f32::from(spot.x), f32::from(spot.y));
+    [3, 4, 5].map(|part| (sums[part] / sums[0].max(1e-6) - DARK_LEVELS).max(1.0))
 }
 
 fn is_depth_edge(scene: &Scene<'_>, spot: Spot) -> bool {
@@ -119,7 +127,7 @@ impl Default for Canvas {
 impl Canvas {
     /// Draw and blend over all holes of the frame.
     pub fn draw(&mut self, scene: &Scene<'_>, live: &Live, chosen: &Chosen<'_>) {
-        let (holes, usually) = (&live.holes, &live.detail);
+        let usually = &live.detail;
         let (width, height) = scene.image.size();
         if self.belief.size() != (width, height) {
             self.color.resize(width, height, [0; 3]);
@@ -142,7 +150,7 @@ impl Canvas {
                 let mut bench = benches.pop().unwrap_or_default();
                 let across = scene.grid.blocks().0;
                 for i in (0..across).filter(|i| live.hole_blocks[j * across + i] != 0) {
-                    bench.blend(scene, holes, chosen, i, j);
+                    bench.blend(scene, live, chosen, (i, j));
                     for plain in &bench.spots.plain {
                         let (top, step) = (plain.top - j * scene.grid.block(), scene.grid.step);
                         for (y, live) in (top..top + step).zip(plain.top..) {
@@ -158,7 +166,11 @@ impl Canvas {
                         cell[0] += count * (plain.darker - NOISE_LEVELS).max(0.0);
                         cell[1] += count;
                     }
-                    for (spot, blended) in bench.blended() {
+                    for (spot, mut blended) in bench.blended() {
+                        let doubt = doubt_of(blended.confidence);
+                        if doubt > 0.0 {
+                            blended.color = without_lamp(blended.color, usual_color(scene, live, spot), doubt);
+                        }
                         let brightness = luma(blended.color);
                         if brightness <= DARKEST_SHARE * usual(scene, usually, spot) {
                             continue;
@@ -169,7 +181,7 @@ impl Canvas {
                         belief[index] = (255.0 * blended.confidence).clamp(f32::from(PLAIN) + 1.0, 255.0) as u8;
                         source[index] = bench.view_of(&blended) as u16;
                         let unsure = RESIDUAL_WEIGHT * (blended.residual - USUAL_RESIDUAL_LEVELS).max(0.0)
-                            + DISAGREEMENT_LEVELS * (USUAL_AGREEMENT - blended.agreement).max(0.0);
+                            + (1.0 - doubt) * DISAGREEMENT_LEVELS * (USUAL_AGREEMENT - blended.agreement).max(0.0);
                         excess[index] = excess_of(scene, spot, blended.color) - unsure;
                         let cell = &mut against[scene.grid.cell_at(x, y)];
                         cell[0] += (brightness - spot.live - NOISE_LEVELS).max(0.0);
@@ -179,7 +191,7 @@ impl Canvas {
                 // More benches than the queue holds are simply freed.
                 let _surplus = benches.push(bench);
             });
-        self.average_darker(scene.grid, holes);
+        self.average_darker(scene.grid, &live.holes);
     }
 
     /// Fill `against`.

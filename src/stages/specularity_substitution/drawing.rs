@@ -6,6 +6,7 @@ use crate::light_field::mapping::is_unoccluded;
 use crate::light_field::view::View;
 use crate::stages::specularity_substitution::drawn::{Blended, Drawn};
 use crate::stages::specularity_substitution::grid::Sums;
+use crate::stages::specularity_substitution::live::Live;
 use crate::stages::specularity_substitution::lookup::{Strip, cubic_across, cubic_down, split};
 use crate::stages::specularity_substitution::scene::Scene;
 use crate::stages::specularity_substitution::small_view::SmallView;
@@ -40,11 +41,11 @@ impl Bench {
     }
 
     /// Blend the views over block (i, j).
-    pub fn blend(&mut self, scene: &Scene<'_>, holes: &[u8], chosen: &Chosen<'_>, i: usize, j: usize) {
+    pub fn blend(&mut self, scene: &Scene<'_>, live: &Live, chosen: &Chosen<'_>, (i, j): (usize, usize)) {
         find_speakers(scene, chosen, (i, j), &mut self.speakers);
         wide::run(FindSpots {
             scene,
-            holes,
+            holes: &live.holes,
             chosen,
             speakers: &self.speakers,
             place: (i, j),
@@ -115,14 +116,14 @@ impl wide::Kernel for Draw<'_> {
         }
         let begin = index * drawn.pitch;
         for (strip, sight) in strips.iter().zip(&*sights) {
+            let spot = &mut spots[sight.spot];
+            let confidence = f32::from(sight.confidence) / 255.0;
             let color = brightened([strip[0], strip[1], strip[2]], &sight.field);
             let brightness = luma(color);
-            let spot = &mut spots[sight.spot];
             if sight.confidence >= CLEAN {
                 spot.clean += 1;
                 spot.luma += brightness;
             }
-            let confidence = f32::from(sight.confidence) / 255.0;
             let place = begin + sight.spot;
             for (plane, channel) in drawn.color.iter_mut().zip(color) {
                 plane[place] = channel;
@@ -228,7 +229,6 @@ mod tests {
     use crate::stages::specularity_substitution::camera_blending::CameraBlending;
     use crate::stages::specularity_substitution::ensemble::MOST_MEMBERS;
     use crate::stages::specularity_substitution::example::{Example, HOLE, in_hole};
-    use crate::stages::specularity_substitution::live::Live;
     use crate::stages::specularity_substitution::settings::Settings;
     use crate::stages::specularity_substitution::view_fit::{Comparison, ViewFit, Workbench};
 
@@ -264,7 +264,7 @@ mod tests {
             vantages: &vantages,
         };
         let mut bench = Bench::default();
-        bench.blend(&scene, &live.holes, &chosen, i, j);
+        bench.blend(&scene, &live, &chosen, (i, j));
         bench
     }
 

@@ -8,7 +8,7 @@ use crate::image::color::luma;
 use crate::image::reduction::sum_of;
 use crate::stages::specularity_substitution::grid::{Grid, SMALL_PER_BLOCK, SMALL_PER_CELL, Smoother, Span, Sums};
 use crate::stages::specularity_substitution::scene::Scene;
-use crate::stages::specularity_substitution::tile::Tile;
+use crate::stages::specularity_substitution::tile::{Tile, total};
 
 /// Added to levels before they are compared as ratios: in the dark ratios are noise.
 pub const DARK_LEVELS: f32 = 6.0;
@@ -37,7 +37,7 @@ pub struct Live {
     pub holes: Vec<u8>,
     /// 1 for every block with such a cell.
     pub hole_blocks: Vec<u8>,
-    /// Per block, smoothed: weight, brightness, squared detail (both relative).
+    /// Per block, smoothed: weight, brightness, squared detail (relative); then red, green and blue, with [`DARK_LEVELS`] added.
     pub detail: Vec<Sums>,
     small: Vec<SmallPixel>,
     smoother: Smoother,
@@ -127,6 +127,11 @@ impl Live {
                 sums[0] += 1.0;
                 sums[1] += brightness;
                 sums[2] += (brightness / mean - 1.0).powi(2);
+            }
+            if let Some(tile) = self.tile(block) {
+                for (sum, plane) in sums[3..].iter_mut().zip(&tile.color) {
+                    *sum = total(plane);
+                }
             }
             self.detail[block] = sums;
         }

@@ -10,7 +10,7 @@
 //!    the live picture (the lamp rides on the camera, so views differ from place to place), the small shift that is left, and how
 //!    well it then fits: three smooth fields by normalized convolution (Knutsson and Westin 1993);
 //! 3. [`blend`], [`drawing`] and [`drawn`]: the views drawn in full over the holes, [`lookup`] by [`lookup`], and blended, the darker
-//!    heard rather than the brighter, since the lamp only adds light;
+//!    heard rather than the brighter, since the lamp only adds light; what all of them show under it loses the [`residual_lamp`];
 //! 4. [`replacement`]: the picture replaced where it is *brighter* than what was measured: the seam lies where both agree, so it
 //!    cannot be seen; [`cut_patches`] are left whole where it would be.
 //!
@@ -29,6 +29,7 @@ pub mod lamp_light;
 pub mod live;
 pub mod lookup;
 mod replacement;
+mod residual_lamp;
 pub mod scene;
 pub mod settings;
 pub mod sight;
