@@ -42,16 +42,14 @@ const DISAGREEMENT_LEVELS: f32 = 90.0;
 /// Tissue is not darker than this share of what lies around it; the gap behind an organ's edge is.
 const DARKEST_SHARE: f32 = 0.5;
 
+/// Where no view is known to have seen a pixel clean, one that is so bright shows the lamp, and a channel may have been clipped: what is
+/// below cannot be told.
+const DAZZLED_LEVELS: f32 = 225.0;
+
 /// The mean luma of the good pixels around a spot, levels.
 fn usual(scene: &Scene<'_>, brightness: &[Sums], spot: Spot) -> f32 {
     let sums = brightness[scene.grid.block_at(spot.x.into(), spot.y.into())];
     (sums[1] / sums[0].max(1e-6) - DARK_LEVELS).max(0.0)
-}
-
-/// The mean colour of the good pixels around a spot, levels.
-fn usual_color(scene: &Scene<'_>, live: &Live, spot: Spot) -> [f32; 3] {
-    let sums = scene.grid.between(&live.detail, f32::from(spot.x), f32::from(spot.y));
-    [3, 4, 5].map(|part| (sums[part] / sums[0].max(1e-6) - DARK_LEVELS).max(1.0))
 }
 
 fn is_depth_edge(scene: &Scene<'_>, spot: Spot) -> bool {
@@ -166,13 +164,10 @@ impl Canvas {
                         cell[0] += count * (plain.darker - NOISE_LEVELS).max(0.0);
                         cell[1] += count;
                     }
-                    for (spot, mut blended) in bench.blended() {
-                        let doubt = doubt_of(blended.confidence);
-                        if doubt > 0.0 {
-                            blended.color = without_lamp(blended.color, usual_color(scene, live, spot), doubt);
-                        }
-                        let brightness = luma(blended.color);
-                        if brightness <= DARKEST_SHARE * usual(scene, usually, spot) {
+                    for (spot, blended) in bench.blended() {
+                        let (brightness, doubt) = (luma(blended.color), doubt_of(blended.confidence));
+                        let dazzled = doubt > 0.0 && blended.color.iter().any(|&level| level > DAZZLED_LEVELS);
+                        if dazzled || brightness <= DARKEST_SHARE * usual(scene, usually, spot) {
                             continue;
                         }
                         let (x, y) = (usize::from(spot.x), usize::from(spot.y) - j * scene.grid.block());
@@ -192,6 +187,28 @@ impl Canvas {
                 let _surplus = benches.push(bench);
             });
         self.average_darker(scene.grid, &live.holes);
+    }
+
+    /// Take the lamp's light off what is to be laid over the picture where no view is known to have seen it clean; `shares` are above
+    /// `tissue` there. What is replaced was decided by what was measured.
+    pub fn take_lamp_off(&mut self, scene: &Scene<'_>, live: &Live, (shares, tissue): (&Image<u8>, u8)) {
+        let width = scene.grid.width.max(1);
+        let rows = self.color.pixels_mut().par_chunks_mut(width).enumerate();
+        let belief = &self.belief;
+        rows.with_min_len(16).for_each(|(y, colors)| {
+            for (x, ((color, &belief), &share)) in colors.iter_mut().zip(belief.row(y)).zip(shares.row(y)).enumerate() {
+                let doubt = if share > tissue {
+                    doubt_of(f32::from(belief) / 255.0)
+                } else {
+                    0.0
+                };
+                if doubt > 0.0 {
+                    let sums = scene.grid.between(&live.detail, x as f32, y as f32);
+                    let nearby = [3, 4, 5].map(|part| (sums[part] / sums[0].max(1e-6) - DARK_LEVELS).max(1.0));
+                    *color = without_lamp(color.map(f32::from), nearby, doubt).map(|v| (v + 0.5) as u8);
+                }
+            }
+        });
     }
 
     /// Fill `against`.

@@ -94,6 +94,11 @@ impl Shares {
         self.look_around();
     }
 
+    /// How much of each pixel goes, and up to where that means nothing.
+    pub fn decided(&self) -> (&Image<u8>, u8) {
+        (&self.own, TISSUE)
+    }
+
     /// Fill `around`.
     fn look_around(&mut self) {
         let (width, height) = self.own.size();

