@@ -4,6 +4,9 @@ use std::fs;
 use std::path::Path;
 use std::process::Command;
 
+use endofield::image::buffer::Image;
+use endofield::media::image_files;
+
 use crate::support::command::{endofield, told};
 
 /// Fails with 1 and says every one of `words`.
@@ -193,4 +196,59 @@ fn a_disk_that_is_full_before_the_end() {
     }
     let ended = limited("enough.mp4", "100000");
     assert_eq!(ended.status.code(), Some(0), "{}", told(&ended));
+}
+
+#[test]
+fn calibrations_of_what_cannot_be_calibrated_from() {
+    let temporary = tempfile::tempdir().unwrap();
+    let folder = temporary.path();
+    for name in ["empty", "gray", "sizes"] {
+        fs::create_dir(folder.join(name)).unwrap();
+    }
+    let gray = |name: &str, width| image_files::write(&folder.join(name), &Image::filled(width, 120, [128; 3])).unwrap();
+    gray("gray/0.png", 160);
+    gray("gray/1.png", 160);
+    gray("sizes/0.png", 160);
+    gray("sizes/1.png", 200);
+    fs::write(folder.join("text.png"), "no picture at all\n").unwrap();
+    fs::write(
+        folder.join("nan.tum"),
+        "# T_base_hand, mm\n0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n",
+    )
+    .unwrap();
+    for (list, pictures) in [
+        ("gray.csv", ["gray/0.png", "gray/1.png"]),
+        ("sizes.csv", ["sizes/0.png", "sizes/1.png"]),
+    ] {
+        let [first, second] = pictures;
+        fs::write(
+            folder.join(list),
+            format!("picture,station,rotation\n{first},a,x\n{second},a,y\n"),
+        )
+        .unwrap();
+    }
+    let board = ["--board", "checkerboard:9x6", "--square-mm", "4"];
+    for (subject, input, words) in [
+        ("camera", "empty", "found none"),
+        ("camera", "gray", "0 of 2"),
+        ("camera", "sizes", "one size"),
+        ("camera", "text.png", "expected a picture"),
+        ("oblique", "empty", "expected a list"),
+        ("oblique", "gray.csv", "none of 2"),
+        ("oblique", "sizes.csv", "one size"),
+    ] {
+        refused(&[&["calibrate", subject, input][..], &board].concat(), folder, &[words]);
+    }
+    for (subject, input, words) in [
+        ("color", "empty", "found none"),
+        ("color", "gray", "0.png and 1 more"),
+        ("color", "text.png", "expected a picture"),
+        ("pivot", "empty", "found a folder"),
+        ("pivot", "nan.tum", "line 3"),
+        ("pivot", "text.png", "16 numbers"),
+        ("time-offset", "empty", "found none"),
+        ("time-offset", "gray", "poses.tum"),
+    ] {
+        refused(&["calibrate", subject, input], folder, &[words]);
+    }
 }

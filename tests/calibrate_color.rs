@@ -143,4 +143,11 @@ fn a_white_target_gives_the_white_balance() {
     // A level is 0.6 % of linear light here.
     assert!((gains[0] / gains[1] * 1.15 - 1.0).abs() < 0.01 && (gains[2] / gains[1] * 0.8 - 1.0).abs() < 0.01);
     assert!(report["delta_e_2000_to_gray"]["after"].as_f64().unwrap() < 0.3);
+    assert_eq!(report["after_tenths"].as_array().unwrap().len(), 100);
+    let plot = image_files::read(&folder.path().join("color_report.png")).unwrap();
+    // The target as seen, and corrected beside it: gray.
+    let middle = plot.height() / 2;
+    assert_eq!(plot.at(200, middle), level);
+    let [red, green, blue] = plot.at(700, middle);
+    assert!(red.abs_diff(green) <= 1 && blue.abs_diff(green) <= 1, "{red} {green} {blue}");
 }

@@ -1,10 +1,12 @@
 //! How camera, hand, board and tracker hang together, on real measurements and through the command.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use endofield::calibration::hand_eye::refinement::{Settings, refine};
 use endofield::calibration::hand_eye::reprojection::Sighting;
-use endofield::calibration::pivot::{Outliers, pivot};
+use endofield::calibration::pivot::fit::{Outliers, pivot};
+use endofield::calibration::plot::style::LEFT_OUT;
 use endofield::camera::distortion::Distortion;
 use endofield::camera::file;
 use endofield::camera::intrinsics::{Intrinsics, Pixel};
@@ -12,6 +14,7 @@ use endofield::camera::model::CameraModel;
 use endofield::geometry::point::Point;
 use endofield::geometry::space::{Board, Camera, Hand, RobotBase};
 use endofield::geometry::transform::Transform;
+use endofield::media::image_files;
 use endofield::robot::hand_eye::HandEye;
 use endofield::robot::trajectory::TumFile;
 use nalgebra::DMatrix;
@@ -23,7 +26,7 @@ fn fixture(name: &str) -> PathBuf {
 }
 
 fn numbers(name: &str) -> DMatrix<f64> {
-    let text = std::fs::read_to_string(fixture("precalib").join(name)).unwrap();
+    let text = fs::read_to_string(fixture("precalib").join(name)).unwrap();
     let rows: Vec<Vec<f64>> = (text.lines())
         .map(|line| line.split_whitespace().map(|word| word.parse().unwrap()).collect())
         .collect();
@@ -156,6 +159,30 @@ fn a_real_pointer_has_its_tip_where_others_found_it() {
     );
 }
 
+#[test]
+fn the_pointer_is_calibrated_as_a_user_types_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let folder = folder.path();
+    let poses = fixture("pivot/pointer.tum");
+    let poses = poses.to_str().unwrap();
+    let output = endofield(&["calibrate", "pivot", poses, "--leave-out-outliers"], folder);
+    assert!(output.status.success(), "{}", told(&output));
+    let table = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(table.contains("left out") && table.contains("pivot.png"), "{table}");
+    let report: serde_json::Value = serde_json::from_str(&fs::read_to_string(folder.join("pivot.json")).unwrap()).unwrap();
+    let views = report["views"].as_array().unwrap();
+    let outliers = views.iter().filter(|view| view["outlier"].as_bool().unwrap()).count();
+    assert!(outliers >= 1 && report["rms_mm"].as_f64().unwrap() < 1.761, "{table}");
+    let plot = image_files::read(&folder.join("pivot.png")).unwrap();
+    assert!(plot.pixels().contains(&LEFT_OUT));
+    let again = endofield(&["calibrate", "pivot", poses], folder);
+    assert!(
+        again.status.code() == Some(1) && told(&again).contains("--force"),
+        "{}",
+        told(&again)
+    );
+}
+
 /// An arm that carries its camera over a board.
 fn simulated(folder: &Path) -> PathBuf {
     let sim = endofield(
@@ -212,11 +239,11 @@ fn the_command_finds_hand_and_clock_of_a_simulated_arm() {
     assert!(mm < 4.0 && deg < 1.0, "{mm} mm, {deg}°\n{}", told(&ran));
     let offset = found.time_offset.unwrap().milliseconds();
     assert!((offset + 40.0).abs() < 3.0, "{offset} ms");
-    let report = std::fs::read_to_string(folder.path().join("hand_eye_report.json")).unwrap();
+    let report = fs::read_to_string(folder.path().join("hand_eye_report.json")).unwrap();
     let report: serde_json::Value = serde_json::from_str(&report).unwrap();
     // The arm's stamps end before the last picture.
     assert!((13..=14).contains(&report["views"].as_array().unwrap().len()));
-    let plot = endofield::media::image_files::read(&folder.path().join("hand_eye_report.png")).unwrap();
+    let plot = image_files::read(&folder.path().join("hand_eye_report.png")).unwrap();
     assert!(plot.width() > 800);
 }
 
@@ -251,7 +278,7 @@ fn the_command_puts_a_camera_right_that_is_a_little_wrong() {
     let with_board = [&arguments[..], &["--board", "checkerboard:9x6", "--square-mm", "4"]].concat();
     let ran = endofield(&with_board, folder.path());
     assert!(ran.status.success(), "{}", told(&ran));
-    let report = std::fs::read_to_string(folder.path().join("found_report.json")).unwrap();
+    let report = fs::read_to_string(folder.path().join("found_report.json")).unwrap();
     let report: serde_json::Value = serde_json::from_str(&report).unwrap();
     let refined = file::read(&folder.path().join("found_camera.yaml")).unwrap();
     let intrinsics = |camera: &CameraModel| {
@@ -296,9 +323,9 @@ fn the_command_puts_a_camera_right_that_is_a_little_wrong() {
         "{mm} mm {deg}°, {plain_mm} mm {plain_deg}°"
     );
     // No file is overwritten, the camera's neither.
-    std::fs::remove_file(folder.path().join("found.yaml")).unwrap();
-    std::fs::remove_file(folder.path().join("found_report.json")).unwrap();
-    std::fs::remove_file(folder.path().join("found_report.png")).unwrap();
+    fs::remove_file(folder.path().join("found.yaml")).unwrap();
+    fs::remove_file(folder.path().join("found_report.json")).unwrap();
+    fs::remove_file(folder.path().join("found_report.png")).unwrap();
     let again = endofield(&with_board, folder.path());
     assert!(
         !again.status.success() && told(&again).contains("found_camera.yaml"),

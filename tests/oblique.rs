@@ -1,5 +1,8 @@
 //! `calibrate oblique`, as a user types it: pictures of a board at three rotations of a 30° telescope, angles not told.
 
+use std::fs;
+
+use endofield::calibration::plot::style::{FIELD, MARGIN, PANEL_WIDTH};
 use endofield::camera::distortion::Distortion;
 use endofield::camera::file;
 use endofield::camera::intrinsics::{Intrinsics, Pixel};
@@ -84,7 +87,7 @@ fn a_telescope_turned_by_unknown_angles_is_calibrated() {
             list += &format!("{file},{station},{name}\n");
         }
     }
-    std::fs::write(folder.path().join("views.csv"), list).unwrap();
+    fs::write(folder.path().join("views.csv"), list).unwrap();
     let command = [
         "calibrate",
         "oblique",
@@ -96,8 +99,7 @@ fn a_telescope_turned_by_unknown_angles_is_calibrated() {
     ];
     let output = endofield(&command, folder.path());
     assert!(output.status.success(), "{}", told(&output));
-    let report: Value =
-        serde_json::from_str(&std::fs::read_to_string(folder.path().join("camera_report.json")).unwrap()).unwrap();
+    let report: Value = serde_json::from_str(&fs::read_to_string(folder.path().join("camera_report.json")).unwrap()).unwrap();
     let number = |key: &str| report[key].as_f64().unwrap();
     let table = String::from_utf8_lossy(&output.stdout).into_owned();
     // Rendered corners are good to some hundredths of a pixel, and no worse than five deviations.
@@ -116,14 +118,58 @@ fn a_telescope_turned_by_unknown_angles_is_calibrated() {
     assert!(joint.axis.angle(&truth.axis) < 0.02, "{table}");
     assert!((file::read(&path).unwrap().intrinsics.fx - 500.0).abs() < 5.0, "{table}");
 
+    let plot = image_files::read(&folder.path().join("camera_report.png")).unwrap();
+    assert_eq!(plot.width(), 2 * PANEL_WIDTH + 3 * MARGIN);
+    // Each picture has a bar, however well it fits: none of their feet is empty ground.
+    let foot = plot.height() - MARGIN - 3;
+    let pictures = report["pictures"].as_array().unwrap().len() as u32;
+    let step = PANEL_WIDTH as f64 / f64::from(pictures);
+    for place in 0..pictures {
+        let x = 2 * MARGIN + PANEL_WIDTH + ((f64::from(place) + 0.5) * step) as usize;
+        assert_ne!(plot.at(x, foot), FIELD, "picture {place}: {table}");
+    }
+
+    // What was taken with the telescope turned is processed by the camera at that angle.
+    let recording = folder.path().join("recording");
+    fs::create_dir_all(recording.join("frames")).unwrap();
+    fs::copy(folder.path().join("0right.png"), recording.join("frames/000000.png")).unwrap();
+    fs::copy(&path, recording.join("camera.yaml")).unwrap();
+    let command = [
+        "process",
+        "recording",
+        "-o",
+        "out/",
+        "--stages",
+        "undistort",
+        "--telescope-angle-deg",
+    ];
+    let output = endofield(&[&command[..], &["25"]].concat(), folder.path());
+    assert!(output.status.success(), "{}", told(&output));
+    let processed = file::read(&folder.path().join("out/camera.yaml")).unwrap().intrinsics;
+    let at_zero = file::read(&path).unwrap();
+    let turned = joint.camera_at(&at_zero, 25.0_f64.to_radians()).intrinsics;
+    assert!(
+        (processed.cx - turned.cx).hypot(processed.cy - turned.cy) < 1e-6,
+        "{processed:?} {turned:?}"
+    );
+    assert!((turned.cx - at_zero.intrinsics.cx).hypot(turned.cy - at_zero.intrinsics.cy) > 0.5);
+    // Where nothing is known to turn, an angle is refused.
+    file::write(&recording.join("camera.yaml"), &at_zero, "straight").unwrap();
+    let output = endofield(&[&command[..], &["25", "--force"]].concat(), folder.path());
+    assert!(
+        output.status.code() == Some(1) && told(&output).contains("calibrate oblique"),
+        "{}",
+        told(&output)
+    );
+
     // Without turning there is no joint to be found.
-    let straight = std::fs::read_to_string(folder.path().join("views.csv")).unwrap();
+    let straight = fs::read_to_string(folder.path().join("views.csv")).unwrap();
     let first_only: String = straight
         .lines()
         .filter(|line| !line.ends_with("left"))
         .map(|line| format!("{line}\n"))
         .collect();
-    std::fs::write(folder.path().join("few.csv"), first_only).unwrap();
+    fs::write(folder.path().join("few.csv"), first_only).unwrap();
     let command = [
         "calibrate",
         "oblique",

@@ -8,5 +8,5 @@ pub mod hand_eye;
 pub mod homography;
 pub mod oblique;
 pub mod pivot;
-pub mod plot_style;
+pub mod plot;
 pub mod time_offset;

@@ -3,58 +3,26 @@
 
 use crate::calibration::camera::coverage::hull;
 use crate::calibration::camera::cross_validation::Difference;
-use crate::calibration::camera::refine::Calibration;
-use crate::calibration::plot_style::{BACKGROUND, CAPTION, FIELD, GRID, LEFT_OUT, MARGIN, PANEL_WIDTH, WHITE};
-use crate::camera::intrinsics::Pixel;
+use crate::calibration::camera::refine::{Calibration, Residual};
+use crate::calibration::plot::field::Field;
+use crate::calibration::plot::style::{BACKGROUND, CAPTION, MARGIN, PANEL_WIDTH, WHITE, round_above};
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::{Canvas, heat};
-
-/// Lengths of a drawn arrow per px of residual, the largest that keeps the longest arrow short.
-const MAGNIFICATIONS: [f64; 9] = [1000.0, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0, 5.0, 2.0];
-/// Longest arrow but a few, px in the plot.
-const LONGEST_ARROW: f64 = 36.0;
 
 /// Draw it.
 pub fn drawn(calibration: &Calibration, difference: Option<&Difference>) -> Image<Rgb8> {
     let camera = &calibration.camera;
-    let zoom = PANEL_WIDTH as f64 / camera.width.max(1) as f64;
-    let height = ((camera.height as f64 * zoom).round() as usize).max(1);
-    let mut canvas = Canvas::new(2 * PANEL_WIDTH + 3 * MARGIN, height + CAPTION + 2 * MARGIN, BACKGROUND);
     let left = MARGIN as f64;
     let right = (2 * MARGIN + PANEL_WIDTH) as f64;
     let top = (MARGIN + CAPTION) as f64;
-    for x in [left, right] {
-        canvas.fill(x, top, PANEL_WIDTH, height, FIELD);
+    let fields = [left, right].map(|x| Field::new([x, top], (camera.width, camera.height)));
+    let height = fields[0].height;
+    let mut canvas = Canvas::new(2 * PANEL_WIDTH + 3 * MARGIN, height + CAPTION + 2 * MARGIN, BACKGROUND);
+    for field in &fields {
+        field.ground(&mut canvas);
     }
-    let at = |panel: f64, pixel: Pixel| [panel + (pixel.x + 0.5) * zoom, top + (pixel.y + 0.5) * zoom];
-    for step in 1..8 {
-        let share = f64::from(step) / 8.0;
-        let (x, y) = (left + share * PANEL_WIDTH as f64, top + share * height as f64);
-        canvas.line([x, top], [x, top + height as f64], GRID);
-        canvas.line([left, y], [left + PANEL_WIDTH as f64, y], GRID);
-    }
-    let mut lengths: Vec<f64> = residuals(calibration)
-        .filter(|residual| residual.used)
-        .map(|residual| residual.error_px[0].hypot(residual.error_px[1]))
-        .collect();
-    lengths.sort_by(f64::total_cmp);
-    let long = lengths.get(lengths.len() * 98 / 100).copied().unwrap_or(1.0).max(1e-6);
-    let magnification = MAGNIFICATIONS.into_iter().find(|m| m * long <= LONGEST_ARROW).unwrap_or(1.0);
-    for residual in residuals(calibration) {
-        let from = at(left, residual.corner.pixel);
-        if !residual.used {
-            canvas.cross(from, LEFT_OUT);
-            continue;
-        }
-        let length = residual.error_px[0].hypot(residual.error_px[1]);
-        let to = [
-            from[0] + magnification * residual.error_px[0],
-            from[1] + magnification * residual.error_px[1],
-        ];
-        let color = heat(length / (1.5 * long));
-        canvas.line(from, to, color);
-        canvas.fill(from[0] - 1.0, from[1] - 1.0, 2, 2, color);
-    }
+    fields[0].grid(&mut canvas);
+    let magnification = fields[0].arrows(&mut canvas, residuals(calibration));
     canvas.text(
         left as usize,
         MARGIN,
@@ -90,26 +58,13 @@ pub fn drawn(calibration: &Calibration, difference: Option<&Difference>) -> Imag
             .collect(),
     );
     for (a, b) in around.iter().zip(around.iter().cycle().skip(1)) {
-        for panel in [left, right] {
-            canvas.line(at(panel, *a), at(panel, *b), WHITE);
+        for field in &fields {
+            canvas.line(field.at(*a), field.at(*b), WHITE);
         }
     }
     canvas.image
 }
 
-fn residuals(calibration: &Calibration) -> impl Iterator<Item = &crate::calibration::camera::refine::Residual> {
+fn residuals(calibration: &Calibration) -> impl Iterator<Item = &Residual> + Clone {
     calibration.views.iter().flat_map(|view| &view.residuals)
-}
-
-/// The next of 1, 2, 5, 10, 20 … hundredths.
-fn round_above(value: f64) -> f64 {
-    let mut round = 0.01;
-    loop {
-        for factor in [1.0, 2.0, 5.0] {
-            if round * factor >= value || round > 1e4 {
-                return round * factor;
-            }
-        }
-        round *= 10.0;
-    }
 }

@@ -1,6 +1,6 @@
 //! A camera's colors from a chart: the chart is found in the picture ([`regions`], [`detection`]), its patches are measured
 //! ([`patches`]), and color correction and uneven light are fitted together ([`fit`]); or a white target tells the white balance
-//! ([`white`]). A [`report`] and a [`plot`] say how good it is.
+//! ([`white`]). A [`report`] and pictures ([`plot`], [`white_plot`]) say how good it is.
 
 pub mod chart;
 pub mod detection;
@@ -12,3 +12,4 @@ pub mod plot;
 pub mod regions;
 pub mod report;
 pub mod white;
+pub mod white_plot;

@@ -6,7 +6,7 @@ use nalgebra::Matrix3;
 use crate::calibration::color::chart::{COLUMNS, PATCHES, ROWS, place};
 use crate::calibration::color::report::Report;
 use crate::calibration::homography;
-use crate::calibration::plot_style::{BACKGROUND, CAPTION, MARGIN, PANEL_WIDTH, WHITE};
+use crate::calibration::plot::style::{BACKGROUND, CAPTION, MARGIN, PANEL_WIDTH, WHITE};
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::Canvas;
 

@@ -16,6 +16,9 @@ const MOST_SPREAD: f64 = 0.15;
 /// Channels farther apart than this are no white or gray target under any white balance.
 const MOST_RATIO: f64 = 6.0;
 
+/// Parts of a picture each way that are looked at by themselves.
+pub const TENTHS: usize = 10;
+
 /// Luminance of linear light.
 const LUMINANCE: [f64; 3] = [0.2126, 0.7152, 0.0722];
 
@@ -63,14 +66,15 @@ pub struct White {
     pub before: f64,
     /// The same, corrected.
     pub after: f64,
-    /// The mean over tenths of the picture of the same, corrected: what gains cannot mend.
+    /// The same of tenths of the pictures each way, row by row, corrected; nothing where too little of a tenth counts.
+    pub after_tenths: Vec<Option<f64>>,
+    /// Its mean: what gains cannot mend.
     pub after_local: f64,
 }
 
 impl White {
     /// From the pictures of a target.
     pub fn measured(images: &[&Image<Rgb8>]) -> Result<Self, NoWhite> {
-        let counts = |pixel: &Rgb8| pixel.iter().all(|level| (RANGE[0]..=RANGE[1]).contains(level));
         let mut ratios: [Vec<f64>; 2] = Default::default();
         let (mut sum, mut all) = ([0.0; 3], 0);
         for image in images {
@@ -107,6 +111,8 @@ impl White {
         let luminance: f64 = color.iter().zip(LUMINANCE).map(|(v, w)| v * w).sum();
         let gains = color.map(|v| luminance / v);
         let seen = sum.map(|v| v / n as f64);
+        let after_tenths = tenths(images, gains);
+        let told: Vec<f64> = after_tenths.iter().flatten().copied().collect();
         Ok(Self {
             gains,
             share,
@@ -114,7 +120,8 @@ impl White {
             seen,
             before: to_gray(seen),
             after: to_gray(scaled(seen, gains)),
-            after_local: local(images, gains, &counts),
+            after_local: told.iter().sum::<f64>() / told.len().max(1) as f64,
+            after_tenths,
         })
     }
 
@@ -131,6 +138,11 @@ impl White {
     }
 }
 
+/// Whether a pixel is neither dark nor clipped.
+pub fn counts(pixel: &Rgb8) -> bool {
+    pixel.iter().all(|level| (RANGE[0]..=RANGE[1]).contains(level))
+}
+
 fn scaled(linear: [f64; 3], gains: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|c| linear[c] * gains[c])
 }
@@ -140,15 +152,15 @@ fn to_gray(linear: [f64; 3]) -> f64 {
     delta_e_2000(lab_from_linear(linear), lab_from_linear([luminance; 3]))
 }
 
-/// Of tenths of the pictures each way: the mean difference of the corrected color to gray.
-fn local(images: &[&Image<Rgb8>], gains: [f64; 3], counts: &dyn Fn(&Rgb8) -> bool) -> f64 {
-    let mut differences = Vec::new();
+/// Of tenths of the pictures each way: how far the corrected color is from gray, the mean over the pictures.
+fn tenths(images: &[&Image<Rgb8>], gains: [f64; 3]) -> Vec<Option<f64>> {
+    let mut differences = vec![(0.0, 0_usize); TENTHS * TENTHS];
     for image in images {
-        let mut cells = vec![([0.0; 3], 0_usize); 100];
+        let mut cells = vec![([0.0; 3], 0_usize); TENTHS * TENTHS];
         let (width, height) = image.size();
         for (index, pixel) in image.pixels().iter().enumerate().filter(|(_, pixel)| counts(pixel)) {
             let (x, y) = (index % width, index / width);
-            if let Some((sum, n)) = cells.get_mut(y * 10 / height * 10 + x * 10 / width) {
+            if let Some((sum, n)) = cells.get_mut(y * TENTHS / height * TENTHS + x * TENTHS / width) {
                 *n += 1;
                 for (sum, level) in sum.iter_mut().zip(pixel) {
                     *sum += linear_from_srgb(f64::from(*level) / 255.0);
@@ -156,13 +168,13 @@ fn local(images: &[&Image<Rgb8>], gains: [f64; 3], counts: &dyn Fn(&Rgb8) -> boo
             }
         }
         let enough = width * height / 400;
-        let means = cells
-            .iter()
-            .filter(|(_, n)| *n > enough)
-            .map(|(sum, n)| sum.map(|v| v / *n as f64));
-        differences.extend(means.map(|mean| to_gray(scaled(mean, gains))));
+        for ((sum, n), (difference, pictures)) in cells.iter().zip(&mut differences).filter(|((_, n), _)| *n > enough) {
+            *difference += to_gray(scaled(sum.map(|v| v / *n as f64), gains));
+            *pictures += 1;
+        }
     }
-    differences.iter().sum::<f64>() / differences.len().max(1) as f64
+    let mean = |(sum, pictures): (f64, usize)| (pictures > 0).then(|| sum / pictures as f64);
+    differences.into_iter().map(mean).collect()
 }
 
 /// Median, and deviation by the median of the distances from it.

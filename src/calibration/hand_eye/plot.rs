@@ -1,14 +1,12 @@
 //! A picture of a hand-eye calibration: left each station's corners with a line to where the arm alone puts them, right how well each
 //! station is predicted by a calibration on the others.
 
-use crate::calibration::plot_style::{BACKGROUND, CAPTION, FIELD, GRID, LEFT_OUT, MARGIN, PANEL_WIDTH, WHITE};
+use crate::calibration::plot::bars::Bars;
+use crate::calibration::plot::field::Field;
+use crate::calibration::plot::style::{BACKGROUND, CAPTION, LEFT_OUT, MARGIN, PANEL_WIDTH, WHITE};
 use crate::camera::intrinsics::Pixel;
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::{Canvas, heat};
-
-/// Decades of the bars' scale, and where it begins, px.
-const DECADES: f64 = 4.0;
-const FIRST_PX: f64 = 0.01;
 
 /// One station.
 #[derive(Clone, Debug)]
@@ -24,15 +22,13 @@ pub struct Drawn {
 }
 
 /// Draw it, for pictures of this size.
-pub fn drawn((width, height): (usize, usize), stations: &[Drawn]) -> Image<Rgb8> {
-    let zoom = PANEL_WIDTH as f64 / width.max(1) as f64;
-    let tall = ((height as f64 * zoom).round() as usize).max(1);
-    let mut canvas = Canvas::new(2 * PANEL_WIDTH + 3 * MARGIN, tall + CAPTION + 2 * MARGIN, BACKGROUND);
+pub fn drawn(size: (usize, usize), stations: &[Drawn]) -> Image<Rgb8> {
     let (left, right, top) = (MARGIN as f64, (2 * MARGIN + PANEL_WIDTH) as f64, (MARGIN + CAPTION) as f64);
-    for x in [left, right] {
-        canvas.fill(x, top, PANEL_WIDTH, tall, FIELD);
-    }
-    let at = |pixel: &Pixel| [left + (pixel.x + 0.5) * zoom, top + (pixel.y + 0.5) * zoom];
+    let field = Field::new([left, top], size);
+    let tall = field.height;
+    let mut canvas = Canvas::new(2 * PANEL_WIDTH + 3 * MARGIN, tall + CAPTION + 2 * MARGIN, BACKGROUND);
+    field.ground(&mut canvas);
+    let at = |pixel: &Pixel| field.at(*pixel);
     let inside = |[x, y]: [f64; 2]| [x.clamp(left, left + PANEL_WIDTH as f64), y.clamp(top, top + tall as f64)];
     let used = stations.iter().filter(|station| !station.outlier);
     let worst = used.map(|station| station.predicted_px).fold(1e-6, f64::max);
@@ -53,29 +49,24 @@ pub fn drawn((width, height): (usize, usize), stations: &[Drawn]) -> Image<Rgb8>
         WHITE,
     );
 
-    let share = |px: f64| ((px / FIRST_PX).max(1.0).log10() / DECADES).min(1.0);
-    let bottom = top + tall as f64;
-    for decade in 1..DECADES as u32 {
-        let y = bottom - f64::from(decade) / DECADES * tall as f64;
-        canvas.line([right, y], [right + PANEL_WIDTH as f64, y], GRID);
-    }
-    let step = PANEL_WIDTH as f64 / stations.len().max(1) as f64;
+    let bars = Bars {
+        corner: [right, top],
+        height: tall,
+        first: 0.01,
+        decades: 4,
+        unit: "px",
+        places: stations.len(),
+    };
+    bars.ground(&mut canvas);
     for (place, station) in stations.iter().enumerate() {
-        let bars = [station.left_out_px, Some(station.predicted_px)];
-        for (half, px) in bars.into_iter().enumerate() {
-            let Some(px) = px.filter(|px| px.is_finite()) else { continue };
-            let high = (share(px) * tall as f64).round();
-            let x = right + (place as f64 + 0.1 + 0.4 * half as f64) * step;
-            let color = color_of(px, worst, station.outlier);
-            let color = if half == 0 { color } else { color.map(|channel| channel / 2) };
-            canvas.fill(x, bottom - high, ((0.4 * step) as usize).max(1), high as usize, color);
+        let color = |px| color_of(px, worst, station.outlier);
+        if let Some(px) = station.left_out_px {
+            bars.bar(&mut canvas, place, [0.1, 0.5], px, color(px));
         }
+        let px = station.predicted_px;
+        bars.bar(&mut canvas, place, [0.5, 0.9], px, color(px).map(|channel| channel / 2));
     }
-    for decade in 1..DECADES as u32 {
-        let y = bottom - f64::from(decade) / DECADES * tall as f64;
-        let px = FIRST_PX * 10.0_f64.powi(decade as i32);
-        canvas.text(right as usize + 4, y as usize + 4, &format!("{px} px"), WHITE);
-    }
+    bars.numbers(&mut canvas);
     canvas.text(right as usize, MARGIN, "stations: left out (bright), used (dark)", WHITE);
     canvas.image
 }

@@ -7,6 +7,7 @@
 //! A board that moves freely between all pictures would tell nothing of the axis: every picture would have a pose of its own.
 
 pub mod joint;
+pub mod plot;
 pub mod refine;
 pub mod report;
 pub mod start;

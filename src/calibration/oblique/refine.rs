@@ -11,7 +11,7 @@ use nalgebra::{DMatrix, Unit};
 
 use crate::calibration::camera::lens::LensModel;
 use crate::calibration::camera::pose::{board_pose, deviation};
-use crate::calibration::camera::refine::{View, calibrate as calibrate_camera};
+use crate::calibration::camera::refine::{Residual, View, calibrate as calibrate_camera};
 use crate::calibration::error::CalibrationError;
 use crate::calibration::oblique::joint::{Angles, Joint, Sighting, State};
 use crate::calibration::oblique::start::{Turned, searched};
@@ -92,6 +92,8 @@ pub struct Calibration {
     pub rms_px: f64,
     /// The same for each sighting.
     pub sighting_rms_px: Vec<f64>,
+    /// For each sighting, of its corners that the solution can see, used or not.
+    pub residuals: Vec<Vec<Residual>>,
     /// Corners used, of all.
     pub used: [usize; 2],
     /// RMS if the telescope's turning were not modelled but each rotation had the first one's camera, px.
@@ -166,7 +168,10 @@ pub fn calibrate(
         return Err(ObliqueError::Straight(obliqueness.to_degrees()));
     }
     let [used, all] = [&kept[..], sightings].map(|all| all.iter().map(|sighting| sighting.corners.len()).sum::<usize>());
-    let found = finished(&solution, covariance, shared, &kept, model, [used, all], fixed_rms_px);
+    let found = Calibration {
+        residuals: residuals(&solution.state, sightings, &kept),
+        ..finished(&solution, covariance, shared, &kept, model, [used, all], fixed_rms_px)
+    };
     // Written so that a figure that is no number is refused too.
     if found.rms_px <= MOST_RMS_PX {
         Ok(found)
@@ -201,9 +206,27 @@ fn finished(
         sighting_rms_px: (kept.iter())
             .map(|sighting| (squares(sighting) / sighting.corners.len().max(1) as f64).sqrt())
             .collect(),
+        residuals: Vec::new(),
         used,
         fixed_rms_px,
     }
+}
+
+/// What the solution leaves of each corner; those of `kept` were used.
+fn residuals(state: &State, sightings: &[Sighting], kept: &[Sighting]) -> Vec<Vec<Residual>> {
+    let of_one = |(sighting, kept): (&Sighting, &Sighting)| -> Vec<Residual> {
+        let errors = state.errors(sighting);
+        (sighting.corners.iter().zip(errors))
+            .filter_map(|(corner, error_px)| {
+                Some(Residual {
+                    corner: *corner,
+                    error_px: error_px?,
+                    used: kept.corners.iter().any(|used| used.site == corner.site),
+                })
+            })
+            .collect()
+    };
+    sightings.iter().zip(kept).map(of_one).collect()
 }
 
 /// The camera of the first rotation, the board at each station, axis and angles; and the RMS without turning, px.

@@ -46,7 +46,9 @@ pub struct PictureReport {
     pub rotation: String,
     /// Corners found.
     pub corners: usize,
-    /// Over residual vectors, px.
+    /// Those of them that were used: the others are too far off.
+    pub corners_used: usize,
+    /// Over residual vectors of the corners used, or of all where none was, px.
     pub rms_px: f64,
 }
 
@@ -135,6 +137,32 @@ impl Report {
         if !unsure.is_empty() {
             warnings.push(format!("angles known badly: {}; add stations there", unsure.join(", ")));
         }
+        let pictures: Vec<PictureReport> = (sightings.iter().enumerate())
+            .map(|(place, sighting)| {
+                let residuals = calibration.residuals.get(place).map_or(&[][..], Vec::as_slice);
+                let corners_used = residuals.iter().filter(|residual| residual.used).count();
+                let rms_px = if corners_used == 0 && !residuals.is_empty() {
+                    let squares = residuals.iter().map(|r| r.error_px[0].powi(2) + r.error_px[1].powi(2));
+                    (squares.sum::<f64>() / residuals.len() as f64).sqrt()
+                } else {
+                    calibration.sighting_rms_px.get(place).copied().unwrap_or(f64::NAN)
+                };
+                PictureReport {
+                    name: name(&names.pictures, place),
+                    station: name(&names.stations, sighting.station),
+                    rotation: name(&names.rotations, sighting.rotation),
+                    corners: sighting.corners.len(),
+                    corners_used,
+                    rms_px,
+                }
+            })
+            .collect();
+        for picture in pictures.iter().filter(|picture| picture.corners_used == 0) {
+            warnings.push(format!(
+                "{} fits nothing else and was left out ({:.2} px off): did head, board or telescope move there?",
+                picture.name, picture.rms_px
+            ));
+        }
         Self {
             version: env!("CARGO_PKG_VERSION"),
             obliqueness_deg: oblique.obliqueness_rad().to_degrees(),
@@ -159,15 +187,7 @@ impl Report {
             rms_px: calibration.rms_px,
             rms_without_turning_px: calibration.fixed_rms_px,
             corners_used: calibration.used,
-            pictures: (sightings.iter().enumerate())
-                .map(|(place, sighting)| PictureReport {
-                    name: name(&names.pictures, place),
-                    station: name(&names.stations, sighting.station),
-                    rotation: name(&names.rotations, sighting.rotation),
-                    corners: sighting.corners.len(),
-                    rms_px: calibration.sighting_rms_px.get(place).copied().unwrap_or(f64::NAN),
-                })
-                .collect(),
+            pictures,
             without_board,
             warnings,
         }
@@ -235,14 +255,14 @@ impl Report {
         }
         let _ = writeln!(
             text,
-            "\n  {:<28}{:>10}{:>10}{:>9}{:>8}",
-            "picture", "station", "rotation", "corners", "RMS px"
+            "\n  {:<28}{:>10}{:>10}{:>9}{:>6}{:>8}",
+            "picture", "station", "rotation", "corners", "used", "RMS px"
         );
         for picture in &self.pictures {
             let _ = writeln!(
                 text,
-                "  {:<28}{:>10}{:>10}{:>9}{:>8.3}",
-                picture.name, picture.station, picture.rotation, picture.corners, picture.rms_px
+                "  {:<28}{:>10}{:>10}{:>9}{:>6}{:>8.3}",
+                picture.name, picture.station, picture.rotation, picture.corners, picture.corners_used, picture.rms_px
             );
         }
         for picture in &self.without_board {

@@ -1,6 +1,6 @@
 //! A picture of a time offset: left how likely each offset is, right the motion of picture and arm over time, laid over each other.
 
-use crate::calibration::plot_style::{BACKGROUND, CAPTION, FIELD, GRID, WHITE};
+use crate::calibration::plot::style::{BACKGROUND, CAPTION, FIELD, GRID, WHITE};
 use crate::image::buffer::{Image, Rgb8};
 use crate::image::canvas::Canvas;
 

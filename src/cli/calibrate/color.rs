@@ -1,21 +1,19 @@
 //! `calibrate color`: what a camera does to colors, from pictures of a chart, or its white balance from a white target.
 
-use std::path::{Path, PathBuf};
-
-use serde_json::json;
+use std::path::PathBuf;
 
 use crate::calibration::color::chart::{self, COLUMNS, Edition, ROWS};
 use crate::calibration::color::detection::{Found, NoChart, find, with_corners};
 use crate::calibration::color::fit::calibrate;
 use crate::calibration::color::patches::{Patch, measured};
 use crate::calibration::color::plot;
-use crate::calibration::color::report::{NotFound, PictureReport, Report, levels_from_linear};
-use crate::calibration::color::white::White;
+use crate::calibration::color::report::{NotFound, PictureReport, Report};
 use crate::calibration::homography;
 use crate::camera::file;
 use crate::camera::intrinsics::Pixel;
 use crate::camera::model::CameraModel;
 use crate::camera::undistortion;
+use crate::cli::calibrate::color_white;
 use crate::cli::calibrate::pictures::{Seen, look_at_all};
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
@@ -28,9 +26,6 @@ use crate::stages::color_normalization::color_file::ColorFile;
 /// More pictures of a chart tell no more, and take longer.
 const MOST_PICTURES: usize = 12;
 
-/// Larger differences to gray from place to place are no matter of white balance, ΔE2000.
-const WHITE_LOCAL: f64 = 3.0;
-
 /// Measure what the camera does to colors.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -41,12 +36,13 @@ const WHITE_LOCAL: f64 = 3.0;
 
 The chart is a ColorChecker Classic (24 patches in four rows of six), turned as you like, whole in the picture, in a light whose white is
 not clipped. The light may fall off toward the border: it is measured with the colors. Beside color.yaml are written color_report.json
-and color_report.png (the chart as found, and each patch as it should be, was, and is). Put color.yaml into a recording's folder, and
+and color_report.png (the chart as found, and each patch as it should be, was, and is; of a white target, what it becomes and how far
+from gray it stays from place to place). Put color.yaml into a recording's folder, and
 `endofield process` applies it.")]
 pub struct Args {
     /// Pictures of the chart or target, folders of pictures, videos or recordings.
     #[arg(required = true, value_name = "PICTURES")]
-    pictures: Vec<PathBuf>,
+    pub(super) pictures: Vec<PathBuf>,
     /// Which chart.
     #[arg(long, value_enum, default_value_t = Chart::Colorchecker24)]
     chart: Chart,
@@ -67,10 +63,10 @@ pub struct Args {
     camera: Option<PathBuf>,
     /// Frames looked at, of a recording or video.
     #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u32).range(1..=100))]
-    frames: u32,
+    pub(super) frames: u32,
     /// Color file to write; the reference in an existing one is kept.
     #[arg(short, long, default_value = "color.yaml", value_name = "FILE")]
-    output: PathBuf,
+    pub(super) output: PathBuf,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -109,15 +105,12 @@ struct Looked {
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let report_path = super::beside(&args.output, "_report.json");
     let plot_path = super::beside(&args.output, "_report.png");
-    for path in [&args.output, &report_path]
-        .into_iter()
-        .chain((!args.white).then_some(&plot_path))
-    {
+    for path in [&args.output, &report_path, &plot_path] {
         context.refuse_overwriting(path)?;
     }
     let camera = args.camera.as_deref().map(file::read).transpose()?;
     if args.white {
-        return white(args, context, &report_path);
+        return color_white::run(args, context, [&report_path, &plot_path]);
     }
     let corners = corners_of(args, camera.as_ref())?;
     let references = chart::references(args.chart.edition());
@@ -140,7 +133,20 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     }
     let (charts, without) = parted(seen);
     let Some((_, first)) = charts.first() else {
-        let reasons: Vec<String> = without.iter().take(3).map(|p| format!("{}: {}", p.name, p.why)).collect();
+        // Most pictures fail for the same reason, which is told once.
+        let mut reasons: Vec<(&str, Vec<&str>)> = Vec::new();
+        for picture in &without {
+            match reasons.iter_mut().find(|(why, _)| *why == picture.why) {
+                Some((_, names)) => names.push(&picture.name),
+                None => reasons.push((&picture.why, vec![&picture.name])),
+            }
+        }
+        let reasons: Vec<String> = (reasons.iter().take(3))
+            .map(|(why, names)| match names[..] {
+                [name] => format!("{name}: {why}"),
+                _ => format!("{} and {} more: {why}", names[0], names.len() - 1),
+            })
+            .collect();
         anyhow::bail!("{}", reasons.join("; "));
     };
     let patches: Vec<Patch> = (charts.iter().enumerate())
@@ -225,7 +231,7 @@ fn undistorted(image: &Image<Rgb8>, camera: &CameraModel) -> anyhow::Result<Imag
 }
 
 /// A file that is to be replaced keeps its reference colors: they are the tissue's, not the camera's.
-fn write_color(args: &Args, correction: Correction) -> anyhow::Result<()> {
+pub(super) fn write_color(args: &Args, correction: Correction) -> anyhow::Result<()> {
     let reference = if args.output.exists() {
         ColorFile::read(&args.output).ok().and_then(|file| file.reference)
     } else {
@@ -236,51 +242,4 @@ fn write_color(args: &Args, correction: Correction) -> anyhow::Result<()> {
         correction: Some(correction),
     };
     Ok(color_file.write(&args.output)?)
-}
-
-/// White balance only.
-fn white(args: &Args, context: &Context, report_path: &Path) -> anyhow::Result<Ended> {
-    let seen = look_at_all(&args.pictures, args.frames as usize, &context.console, &Image::clone)?;
-    let images: Vec<&Image<Rgb8>> = seen.iter().map(|seen| &seen.found).collect();
-    let white = White::measured(&images)?;
-    write_color(args, white.correction())?;
-    let levels = |linear: [f64; 3]| levels_from_linear(linear).map(|v| (v * 10.0).round() / 10.0);
-    let corrected: [f64; 3] = std::array::from_fn(|c| white.seen[c] * white.gains[c]);
-    super::write_json(
-        report_path,
-        &json!({
-            "version": env!("CARGO_PKG_VERSION"),
-            "target": "white or gray",
-            "pictures": seen.iter().map(|seen| seen.name.as_str()).collect::<Vec<_>>(),
-            "gains": white.gains,
-            "share_of_picture": white.share,
-            "spread": white.spread,
-            "seen": levels(white.seen),
-            "corrected": levels(corrected),
-            "delta_e_2000_to_gray": { "before": white.before, "after": white.after, "after_mean_of_tenths": white.after_local },
-        }),
-    )?;
-    let mut text = format!(
-        "white balance by {} picture{}, {:.0} % of them neither dark nor clipped\n  gains            red {:.4}  green {:.4}  blue {:.4}  (linear light)\n",
-        seen.len(),
-        if seen.len() == 1 { "" } else { "s" },
-        100.0 * white.share,
-        white.gains[0],
-        white.gains[1],
-        white.gains[2]
-    );
-    text += &format!(
-        "  mean color       {:?} becomes {:?}\n  \u{394}E2000 to gray   {:.2} before, {:.2} after; {:.2} after in tenths of the picture, mean\n",
-        levels(white.seen),
-        levels(corrected),
-        white.before,
-        white.after,
-        white.after_local
-    );
-    if white.after_local > WHITE_LOCAL {
-        text += "  warning: the target's color changes over the picture; is other light in the room on it?\n";
-    }
-    console::print(&text)?;
-    super::say_written(&[&args.output, report_path])?;
-    Ok(Ended::Complete)
 }

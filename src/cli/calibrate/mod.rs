@@ -3,6 +3,7 @@
 pub mod camera;
 pub mod camera_path;
 pub mod color;
+pub mod color_white;
 pub mod hand_eye;
 pub mod hand_eye_camera;
 pub mod hand_eye_report;

@@ -12,12 +12,14 @@ use crate::calibration::board::pattern::BoardLayout;
 use crate::calibration::board::placement::Naming;
 use crate::calibration::camera::lens::LensModel;
 use crate::calibration::oblique::joint::{Angles, Sighting};
+use crate::calibration::oblique::plot;
 use crate::calibration::oblique::refine::calibrate;
 use crate::calibration::oblique::report::{Names, Report};
 use crate::camera::file;
 use crate::cli::calibrate::pictures::look_at_all;
 use crate::cli::console;
 use crate::cli::context::{Context, Ended, UsageError};
+use crate::media::image_files;
 
 /// A board of fewer corners tells too little.
 const LEAST_CORNERS: usize = 8;
@@ -39,7 +41,8 @@ stations, each other one at two or more. angle_deg may be left out, for some or 
 positive where the picture turns clockwise. rotation may be left out where angle_deg is given.
 
 camera.yaml holds the camera at angle 0 as any camera file does, and a block `oblique` for the joint, which other readers pass over.
-Beside it is written camera_report.json, with covariance.")]
+Beside it are written camera_report.json, with covariance, and camera_report.png: what is left of each corner, and how well each picture
+fits.")]
 pub struct Args {
     /// The list of pictures.
     #[arg(value_name = "CSV")]
@@ -97,9 +100,15 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
         .into());
     }
     let report_path = super::beside(&args.output, "_report.json");
-    for path in [&args.output, &report_path] {
+    let plot_path = super::beside(&args.output, "_report.png");
+    for path in [&args.output, &report_path, &plot_path] {
         context.refuse_overwriting(path)?;
     }
+    anyhow::ensure!(
+        !args.views.is_dir(),
+        "{}: expected a list of pictures (CSV), found a folder; `endofield calibrate oblique --help` shows such a list",
+        args.views.display()
+    );
     let text = std::fs::read_to_string(&args.views).with_context(|| format!("{}: cannot be read", args.views.display()))?;
     let views = parsed(&text).map_err(|what| anyhow::anyhow!("{}: {what}", args.views.display()))?;
     let folder = args.views.parent().unwrap_or(Path::new(""));
@@ -147,6 +156,12 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
             Err(why) => without.push(format!("{}: {why}", line.picture)),
         }
     }
+    anyhow::ensure!(
+        !sightings.is_empty(),
+        "expected the board in the pictures, found it in none of {}; {}",
+        without.len(),
+        without.iter().take(3).cloned().collect::<Vec<_>>().join("; ")
+    );
     let angles = Angles {
         given_rad: views.angles_deg.iter().map(|angle| angle.map(f64::to_radians)).collect(),
         sigma_rad: args.angle_sigma_deg.to_radians(),
@@ -162,8 +177,9 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     let report = Report::new(&calibration, &sightings, &angles.given_rad, &names, without);
     file::write_oblique(&args.output, &calibration.camera, &calibration.oblique, "endofield")?;
     super::write_json(&report_path, &serde_json::to_value(&report)?)?;
+    image_files::write(&plot_path, &plot::drawn(&calibration, &report))?;
     console::print(&report.table())?;
-    super::say_written(&[&args.output, &report_path])?;
+    super::say_written(&[&args.output, &report_path, &plot_path])?;
     Ok(Ended::Complete)
 }
 

@@ -5,12 +5,14 @@ use std::path::PathBuf;
 
 use serde::Serialize;
 
-use crate::calibration::pivot::{Outliers, Pivot, pivot};
+use crate::calibration::pivot::fit::{Outliers, Pivot, pivot};
+use crate::calibration::pivot::plot;
 use crate::cli::calibrate::pose_files;
 use crate::cli::console;
 use crate::cli::context::{Context, Ended};
 use crate::geometry::space::{Hand, RobotBase};
 use crate::geometry::transform::Transform;
+use crate::media::image_files;
 
 /// Find the tip of a tracked pointer from poses while it turned about it.
 #[derive(Debug, clap::Args)]
@@ -18,7 +20,8 @@ use crate::geometry::transform::Transform;
   endofield calibrate pivot pointer.tum
   endofield calibrate pivot poses/*.txt --leave-out-outliers -o pointer.json
 
-Put the tip into a small hole, tilt the tool by 30° and more to all sides, and record its poses (the tracker's or the arm's).")]
+Put the tip into a small hole, tilt the tool by 30° and more to all sides, and record its poses (the tracker's or the arm's).
+Beside pivot.json is written pivot.png: where each pose puts the tip, and how far off that is.")]
 pub struct Args {
     /// Poses of the tool: a TUM file, or 4×4 matrices, one a file.
     #[arg(required = true, value_name = "POSES")]
@@ -51,12 +54,16 @@ struct Report {
 struct View {
     name: String,
     distance_mm: f64,
+    offset_mm: [f64; 3],
     outlier: bool,
 }
 
 /// Run it.
 pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
-    context.refuse_overwriting(&args.output)?;
+    let plot_path = super::beside(&args.output, ".png");
+    for path in [&args.output, &plot_path] {
+        context.refuse_overwriting(path)?;
+    }
     let named: Vec<(String, Transform<RobotBase, Hand>)> = pose_files::read(&args.poses)?;
     let (names, poses): (Vec<_>, Vec<_>) = named.into_iter().unzip();
     let outliers = if args.leave_out_outliers {
@@ -64,17 +71,19 @@ pub fn run(args: &Args, context: &Context) -> anyhow::Result<Ended> {
     } else {
         Outliers::Kept
     };
-    let report = Report::new(&pivot(&poses, outliers)?, names, args.leave_out_outliers);
+    let found = pivot(&poses, outliers)?;
+    let report = Report::new(&found, names, args.leave_out_outliers);
     super::write_json(&args.output, &serde_json::to_value(&report)?)?;
+    image_files::write(&plot_path, &plot::drawn(&found))?;
     console::print(&report.table())?;
-    super::say_written(&[&args.output])?;
+    super::say_written(&[&args.output, &plot_path])?;
     Ok(Ended::Complete)
 }
 
 impl Report {
     fn new(found: &Pivot, names: Vec<String>, outliers_left_out: bool) -> Self {
         let deviations = |first: usize| [0, 1, 2].map(|i| found.covariance[(first + i, first + i)].max(0.0).sqrt());
-        let seen = names.into_iter().zip(&found.distances_mm).zip(&found.outliers);
+        let seen = names.into_iter().zip(&found.offsets_mm).zip(&found.outliers);
         Self {
             version: env!("CARGO_PKG_VERSION"),
             tip_mm: found.tip.coords.into(),
@@ -82,12 +91,13 @@ impl Report {
             rest_mm: found.rest.coords.into(),
             rest_sigma_mm: deviations(3),
             rms_mm: found.rms_mm,
-            poses: found.distances_mm.len(),
+            poses: found.offsets_mm.len(),
             outliers_left_out,
             views: seen
-                .map(|((name, &distance_mm), &outlier)| View {
+                .map(|((name, offset), &outlier)| View {
                     name,
-                    distance_mm,
+                    distance_mm: offset.norm(),
+                    offset_mm: (*offset).into(),
                     outlier,
                 })
                 .collect(),

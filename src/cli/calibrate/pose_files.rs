@@ -29,6 +29,11 @@ pub fn read<To, From>(files: &[PathBuf]) -> anyhow::Result<Vec<(String, Transfor
 
 /// A pose as sixteen numbers, row by row.
 fn matrix<To, From>(path: &Path) -> anyhow::Result<Transform<To, From>> {
+    anyhow::ensure!(
+        !path.is_dir(),
+        "{}: expected a pose file (TUM, or 4×4 matrices, one a file), found a folder; name the files in it",
+        path.display()
+    );
     let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
     let numbers: Vec<f64> = (text.split(|c: char| c.is_whitespace() || c == ',' || c == ';'))
         .filter_map(|word| word.parse().ok())

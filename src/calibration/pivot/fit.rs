@@ -4,7 +4,7 @@
 //! `[R −I]·(t, p) = −s`, solved for all poses at once (the "algebraic one-step" of Yaniv 2015, doi:10.1117/12.2081348, who finds it as
 //! good as fitting a sphere and more robust to how the tool was moved).
 
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, SymmetricEigen, Vector3, Vector6};
 
 use crate::geometry::point::Point;
 use crate::geometry::space::{Hand, RobotBase};
@@ -28,8 +28,8 @@ pub struct Pivot {
     pub covariance: Matrix6<f64>,
     /// Root mean square along an axis of how far the tips are from the place of rest, mm.
     pub rms_mm: f64,
-    /// How far each pose's tip is from it, mm.
-    pub distances_mm: Vec<f64>,
+    /// Where each pose's tip is from there, mm.
+    pub offsets_mm: Vec<Vector3<f64>>,
     /// Poses much farther off than the middle one.
     pub outliers: Vec<bool>,
 }
@@ -74,10 +74,8 @@ pub fn pivot(poses: &[Transform<RobotBase, Hand>], outliers: Outliers) -> Result
             .filter_map(|(pose, out)| (!out).then_some(pose))
             .collect();
         let found = of_all(&chosen)?;
-        let distances_mm: Vec<f64> = poses
-            .iter()
-            .map(|pose| (*pose * found.tip - found.rest).coords.norm())
-            .collect();
+        let offsets_mm: Vec<Vector3<f64>> = poses.iter().map(|pose| (*pose * found.tip - found.rest).coords).collect();
+        let distances_mm: Vec<f64> = offsets_mm.iter().map(Vector3::norm).collect();
         // The middle length of vectors of three normal numbers is 1.54 deviations.
         let mut sorted = distances_mm.clone();
         sorted.sort_by(f64::total_cmp);
@@ -87,7 +85,7 @@ pub fn pivot(poses: &[Transform<RobotBase, Hand>], outliers: Outliers) -> Result
             .collect();
         if outliers == Outliers::Kept || distant == left_out {
             return Ok(Pivot {
-                distances_mm,
+                offsets_mm,
                 outliers: distant,
                 ..found
             });
@@ -96,7 +94,7 @@ pub fn pivot(poses: &[Transform<RobotBase, Hand>], outliers: Outliers) -> Result
     }
 }
 
-/// Least squares; distances are left empty.
+/// Least squares; offsets are left empty.
 fn of_all(poses: &[&Transform<RobotBase, Hand>]) -> Result<Pivot, PivotError> {
     if poses.len() < LEAST_POSES {
         return Err(PivotError::TooFew(poses.len()));
@@ -123,14 +121,14 @@ fn of_all(poses: &[&Transform<RobotBase, Hand>]) -> Result<Pivot, PivotError> {
         rest: Point::new(answer[3], answer[4], answer[5]),
         covariance: inverse * (sum / (rows - 6) as f64),
         rms_mm: (sum / rows as f64).sqrt(),
-        distances_mm: Vec::new(),
+        offsets_mm: Vec::new(),
         outliers: Vec::new(),
     })
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::{UnitQuaternion, Vector3};
+    use nalgebra::UnitQuaternion;
     use rand::{RngExt as _, SeedableRng as _};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::StandardNormal;
@@ -186,8 +184,8 @@ mod tests {
         let mut poses = poses(3, 30, [0.5, 0.5], 0.3);
         poses[7] = Transform::new(poses[7].rotation(), poses[7].translation() + Vector3::new(0.0, 12.0, 5.0));
         let found = pivot(&poses, Outliers::LeftOut).unwrap();
-        assert!((0..30).all(|i| found.outliers[i] == (i == 7)), "{:?}", found.distances_mm);
-        assert!((found.distances_mm[7] - 13.0).abs() < 1.5);
+        assert!((0..30).all(|i| found.outliers[i] == (i == 7)), "{:?}", found.offsets_mm);
+        assert!((found.offsets_mm[7].norm() - 13.0).abs() < 1.5);
     }
 
     #[test]

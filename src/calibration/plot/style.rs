@@ -18,3 +18,16 @@ pub const GRID: Rgb8 = [66, 66, 74];
 pub const WHITE: Rgb8 = [235, 235, 235];
 /// What was measured and not used.
 pub const LEFT_OUT: Rgb8 = [255, 60, 200];
+
+/// The next of 1, 2, 5, 10, 20 … hundredths: where a scale ends.
+pub fn round_above(value: f64) -> f64 {
+    let mut round = 0.01;
+    loop {
+        for factor in [1.0, 2.0, 5.0] {
+            if round * factor >= value || round > 1e4 {
+                return round * factor;
+            }
+        }
+        round *= 10.0;
+    }
+}
