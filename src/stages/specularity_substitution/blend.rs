@@ -42,9 +42,9 @@ const DISAGREEMENT_LEVELS: f32 = 90.0;
 /// Tissue is not darker than this share of what lies around it; the gap behind an organ's edge is.
 const DARKEST_SHARE: f32 = 0.5;
 
-/// Where no view is known to have seen a pixel clean, one that is so bright shows the lamp, and a channel may have been clipped: what is
-/// below cannot be told.
-const DAZZLED_LEVELS: f32 = 225.0;
+/// Where no view is known to have seen a pixel clean, one with all channels above this shows the lamp, and some may have been clipped: what
+/// is below cannot be told.
+const DAZZLED_LEVELS: f32 = 200.0;
 
 /// The mean luma of the good pixels around a spot, levels.
 fn usual(scene: &Scene<'_>, brightness: &[Sums], spot: Spot) -> f32 {
@@ -166,7 +166,7 @@ impl Canvas {
                     }
                     for (spot, blended) in bench.blended() {
                         let (brightness, doubt) = (luma(blended.color), doubt_of(blended.confidence));
-                        let dazzled = doubt > 0.0 && blended.color.iter().any(|&level| level > DAZZLED_LEVELS);
+                        let dazzled = doubt > 0.0 && blended.color.iter().all(|&level| level > DAZZLED_LEVELS);
                         if dazzled || brightness <= DARKEST_SHARE * usual(scene, usually, spot) {
                             continue;
                         }
