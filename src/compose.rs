@@ -248,7 +248,12 @@ fn light_field_stages(config: &Config, equipment: &Equipment<'_>, rolls: bool, l
         line.stages.push(Box::new(stamping));
     }
     if equipment.light_field.is_none() && rolls {
-        let maker = made_at_once(config, door.clone());
+        // The last frames were stamped already: an offset found among them would reach some frames still under way and not others.
+        let of_frames = LightFieldDoor {
+            time_offset: None,
+            ..door.clone()
+        };
+        let maker = made_at_once(config, of_frames);
         line.stages.push(Box::new(RollingLightField::new(&config.rolling, maker)));
     }
     line.stages.push(Box::new(PoseRefinement::awaiting(
