@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use crate::camera::model::CameraModel;
 use crate::config::Config;
+use crate::frame::FrameId;
 use crate::light_field::view::LightField;
 use crate::pipeline::slot::Slot;
 use crate::pipeline::stage::Stage;
@@ -112,14 +113,19 @@ pub struct LightFieldDoor {
 impl LightFieldDoor {
     /// Make the light field ready, in the caller's thread; each stage takes its part before its next frame.
     pub fn bring(&self, light_field: Arc<LightField>) {
+        self.bring_from(FrameId(0), light_field);
+    }
+
+    /// The same, for frame `first` and those after it: frames before it that are still under way keep what they had.
+    fn bring_from(&self, first: FrameId, light_field: Arc<LightField>) {
         let offset = light_field.time_offset;
         let reference = Reference::new(Arc::clone(&light_field), &self.alignment);
         let witnesses = Witnesses::new(light_field);
         if let Some(slot) = self.time_offset.as_ref().filter(|_| offset != Span(0)) {
-            slot.put(offset);
+            slot.put(first, offset);
         }
-        self.reference.put(reference);
-        self.witnesses.put(witnesses);
+        self.reference.put(first, reference);
+        self.witnesses.put(first, witnesses);
     }
 }
 
@@ -300,15 +306,17 @@ fn stamping(config: &Config, equipment: &Equipment<'_>, door: &mut LightFieldDoo
 fn made_at_once(config: &Config, door: LightFieldDoor) -> Maker {
     let (trust, settings) = (config.survey.clone(), config.rolling.clone());
     let mut told = false;
-    Box::new(move |batch, camera| match batch.built(camera, &trust, &settings, &Silent) {
-        Ok(light_field) => {
-            tracing::debug!("a light field of {} of the last frames", light_field.views.len());
-            door.bring(Arc::new(light_field));
-        }
-        Err(error) if !told => {
-            told = true;
-            tracing::warn!("specular: no light field could be made of the last frames, a later one may: {error}");
-        }
-        Err(_) => {}
-    })
+    Box::new(
+        move |batch, camera, first| match batch.built(camera, &trust, &settings, &Silent) {
+            Ok(light_field) => {
+                tracing::debug!("a light field of {} of the last frames", light_field.views.len());
+                door.bring_from(first, Arc::new(light_field));
+            }
+            Err(error) if !told => {
+                told = true;
+                tracing::warn!("specular: no light field could be made of the last frames, a later one may: {error}");
+            }
+            Err(_) => {}
+        },
+    )
 }

@@ -155,7 +155,7 @@ impl Stage for PoseRefinement {
                 "no specularity mask: the detection stage must run before the pose refinement".into(),
             ));
         };
-        if let Some(newer) = self.newer.take() {
+        if let Some(newer) = self.newer.take(frame.id) {
             self.reference = Some(newer);
         }
         let Some(mut reference) = self.reference.take() else {

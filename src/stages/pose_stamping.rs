@@ -96,7 +96,7 @@ impl Stage for PoseStamping {
     }
 
     fn process(&mut self, frame: &mut Frame) -> Result<(), StageError> {
-        if let Some(newer) = self.newer.take() {
+        if let Some(newer) = self.newer.take(frame.id) {
             self.time_offset = newer;
         }
         let Ok(pose) = self.poses.pose_at(frame.exposed_at, self.time_offset) else {

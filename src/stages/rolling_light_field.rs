@@ -5,7 +5,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use crate::camera::model::CameraModel;
-use crate::frame::{Analysis, Frame};
+use crate::frame::{Analysis, Frame, FrameId};
 use crate::image::buffer::Mask;
 use crate::light_field::build::view_of;
 use crate::light_field::rolling::{Batch, RollingViews, Settings};
@@ -13,8 +13,8 @@ use crate::light_field::selection::sharpness;
 use crate::light_field::view::View;
 use crate::pipeline::stage::{Stage, StageError};
 
-/// Who makes light fields of the views: at once, or beside the line.
-pub type Maker = Box<dyn FnMut(Batch, &CameraModel) + Send>;
+/// Who makes light fields of the views. The frame is the first one they are for.
+pub type Maker = Box<dyn FnMut(Batch, &CameraModel, FrameId) + Send>;
 
 /// Collects views.
 pub struct RollingLightField {
@@ -76,7 +76,7 @@ impl Stage for RollingLightField {
         silence(&mut view.confidence, analysis);
         self.views.join(view);
         if let Some(batch) = self.views.due() {
-            (self.maker)(batch, &camera);
+            (self.maker)(batch, &camera, frame.id);
         }
         Ok(())
     }

@@ -309,7 +309,7 @@ impl Stage for SpecularitySubstitution {
         if frame.scene_cut {
             self.reset();
         }
-        if let Some(witnesses) = self.newer.take() {
+        if let Some(witnesses) = self.newer.take(frame.id) {
             self.adopt(witnesses);
         }
         let light_field = self.light_field.clone();
