@@ -114,7 +114,7 @@ pub struct OutputSettings {
 impl Default for OutputSettings {
     fn default() -> Self {
         Self {
-            crf: 10,
+            crf: 8,
             preset: "veryfast".to_owned(),
         }
     }

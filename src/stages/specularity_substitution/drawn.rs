@@ -2,8 +2,10 @@
 
 use crate::image::wide;
 
-/// A view that is this much brighter than the blend counts for half, levels: the lamp only adds light.
+/// A view that may show the lamp and is this much brighter than the blend counts for half, levels: the lamp only adds light.
 const BRIGHTER_HALF_LEVELS: f32 = 0.8;
+/// The same for a view that is sure to show tissue: what it is brighter by is noise, and to hear only the darker would keep the noise.
+const BRIGHTER_HALF_WHERE_SURE: f32 = 6.8;
 /// Rounds of that.
 const ROUNDS: usize = 5;
 /// Views agree with the blend within this, levels, and this share of its luma.
@@ -71,6 +73,12 @@ impl Drawn {
     }
 }
 
+/// How much brighter than the blend a view of this confidence is where it counts for half, levels.
+#[inline(always)]
+fn half_levels(confidence: f32) -> f32 {
+    BRIGHTER_HALF_LEVELS + (BRIGHTER_HALF_WHERE_SURE - BRIGHTER_HALF_LEVELS) * confidence * confidence
+}
+
 /// Every spot's colour from its speakers, the darker heard rather than the brighter.
 struct Blend<'a> {
     drawn: &'a Drawn,
@@ -89,8 +97,9 @@ impl wide::Kernel for Blend<'_> {
             };
             let weights = |speaker: usize, reference: &[f32; LANES]| -> [f32; LANES] {
                 let (weight, luma) = (lanes(&drawn.weight, speaker), lanes(&drawn.luma, speaker));
+                let confidence = lanes(&drawn.confidence, speaker);
                 std::array::from_fn(|lane| {
-                    let brighter = (luma[lane] - reference[lane]).max(0.0) * (1.0 / BRIGHTER_HALF_LEVELS);
+                    let brighter = (luma[lane] - reference[lane]).max(0.0) / half_levels(confidence[lane]);
                     weight[lane] / (1.0 + brighter * brighter)
                 })
             };
@@ -159,13 +168,13 @@ mod tests {
     use crate::image::color::luma;
 
     /// The plainest possible blend of one spot.
-    fn reference(drawn: &[([f32; 3], f32)]) -> Option<[f32; 3]> {
+    fn reference(drawn: &[([f32; 3], f32, f32)]) -> Option<[f32; 3]> {
         let mut reference = f32::INFINITY;
         let mut color = None;
         for _ in 0..=ROUNDS {
             let (mut sum, mut total) = ([0.0_f32; 3], 0.0);
-            for (color, weight) in drawn {
-                let brighter = (luma(*color) - reference).max(0.0) / BRIGHTER_HALF_LEVELS;
+            for (color, weight, confidence) in drawn {
+                let brighter = (luma(*color) - reference).max(0.0) / half_levels(*confidence);
                 let weight = weight / (1.0 + brighter * brighter);
                 for (sum, channel) in sum.iter_mut().zip(color) {
                     *sum += weight * channel;
@@ -199,6 +208,7 @@ mod tests {
                     }
                     drawn.luma[at] = luma(color);
                     drawn.weight[at] = random.random_range(0.01..1.0);
+                    drawn.confidence[at] = random.random_range(0.0..1.0);
                 }
             }
         }
@@ -208,7 +218,7 @@ mod tests {
         for (k, blended) in blended.iter().enumerate() {
             let of = |speaker: usize| {
                 let at = speaker * drawn.pitch + k;
-                ([0, 1, 2].map(|c| drawn.color[c][at]), drawn.weight[at])
+                ([0, 1, 2].map(|c| drawn.color[c][at]), drawn.weight[at], drawn.confidence[at])
             };
             let expected = reference(&(0..speakers).map(of).collect::<Vec<_>>());
             assert_eq!(blended.is_some(), expected.is_some(), "{k}");
