@@ -151,6 +151,11 @@ impl Stage for PoseRefinement {
             self.reset();
         }
         let Some(analysis) = &frame.analysis else {
+            if frame.timings.iter().any(|timing| timing.bypassed) {
+                // Live, the detection rests or was passed by for lack of time: nothing is known of this picture.
+                frame.alignment = Some(Alignment::default());
+                return Ok(());
+            }
             return Err(StageError(
                 "no specularity mask: the detection stage must run before the pose refinement".into(),
             ));

@@ -81,6 +81,9 @@ impl Corner {
     }
 }
 
+/// Farther from the mask than this one place of a cell is enough; for a picture of the usual width.
+const NEAR_PX: f32 = 5.0;
+
 /// Places of a cell: what a view sees clean between two lobes may be no wider than half a cell.
 const PLACES_PER_CELL: usize = 4;
 
@@ -169,6 +172,7 @@ impl CameraBlending {
     /// A pixel for every quarter of a cell with a hole: the specular one nearest to the quarter's middle, else the one nearest to the mask.
     fn find_places(&mut self, scene: &Scene<'_>, holes: &[u8]) {
         let grid = scene.grid;
+        let near = Scene::distance_of(NEAR_PX * scene.scale);
         self.lattice.clear();
         self.lattice.resize(grid.count() * PLACES_PER_CELL, Place::default());
         self.lattice
@@ -182,7 +186,10 @@ impl CameraBlending {
                         continue;
                     }
                     let (left, top) = (column * grid.cell + quarter % 2 * half, row * grid.cell + quarter / 2 * half);
-                    *place = place_in(scene, left, top, half);
+                    let found = place_in(scene, left, top, half);
+                    if quarter == 0 || scene.distance.at(found.x as usize, found.y as usize) <= near {
+                        *place = found;
+                    }
                 }
             });
         self.places.clear();

@@ -32,11 +32,11 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             guard_px: 5.0,
-            reach_px: 16.0,
+            reach_px: 12.0,
             margin_px: 24.0,
             excess_low_levels: 2.0,
             excess_high_levels: 5.0,
-            max_views: 64,
+            max_views: 40,
             align_on_ring: true,
             ring_rounds: 2,
             max_shift_px: 4.0,
