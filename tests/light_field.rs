@@ -150,7 +150,7 @@ fn depth_gains_pictures_and_files() {
         squares += f64::from(a - b).powi(2);
         count += 1.0;
     }
-    let rms = (squares / count as f64).sqrt();
+    let rms = (squares / count).sqrt();
     assert!(rms < 0.3, "depth error {rms} mm rms over {count} pixels");
 
     // Exposures come back up to a common factor; sRGB values go with exposure^(1/2.2).

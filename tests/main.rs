@@ -1,6 +1,7 @@
 //! The integration tests, one binary.
 #![allow(
     clippy::unwrap_used,
+    clippy::print_stderr,
     clippy::expect_used,
     clippy::panic,
     reason = "a helper of a test may fail the test; clippy excuses only the test functions themselves"

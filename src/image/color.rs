@@ -55,7 +55,7 @@ pub fn fast_linear(encoded: f32) -> f32 {
 pub fn fast_srgb(linear: f32) -> f32 {
     let half = linear.sqrt();
     let fourth = half.sqrt();
-    (0.662_002_7 * half + 0.684_122_06 * fourth - 0.323_583_6 * fourth.sqrt() - 0.022_541_147 * linear).max(0.0)
+    (0.662_002_7 * half + 0.684_122_1 * fourth - 0.323_583_6 * fourth.sqrt() - 0.022_541_147 * linear).max(0.0)
 }
 
 /// CIE XYZ (Y = 1 for white) from 8-bit sRGB.

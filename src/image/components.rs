@@ -209,7 +209,13 @@ mod tests {
     #[test]
     fn every_set_pixel_lies_in_one_region() {
         let pixels: Vec<u8> = (0..64 * 48)
-            .map(|i| if (i * 2654435761_usize >> 7) % 3 == 0 { 255 } else { 0 })
+            .map(|i| {
+                if ((i * 2_654_435_761_usize) >> 7).is_multiple_of(3) {
+                    255
+                } else {
+                    0
+                }
+            })
             .collect();
         let noisy = Image::from_vec(64, 48, pixels).unwrap();
         let mut components = Components::default();

@@ -418,7 +418,7 @@ mod tests {
                 count += 1.0;
             }
         }
-        assert!((squares / count as f64).sqrt() < 0.06, "{}", (squares / count as f64).sqrt());
+        assert!((squares / count).sqrt() < 0.06, "{}", (squares / count).sqrt());
         let facing = (mesh.triangles.iter())
             .filter(|t| {
                 let [a, b, c] = t.map(|i| mesh.vertices[i as usize].coords);

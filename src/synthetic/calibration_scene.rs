@@ -66,10 +66,6 @@ pub fn simulate_boards(out: &Path, settings: &Settings, progress: &dyn Progress)
     Ok(summary)
 }
 
-#[expect(
-    clippy::too_many_arguments,
-    reason = "one recording is these things; a struct for one call would only rename them"
-)]
 fn write_board_recording(
     out: &Path,
     name: &str,

@@ -105,6 +105,7 @@ impl WindowSystem {
             figures: String::new(),
             picture: Image::filled(0, 0, [0; 3]),
             notice: None,
+            #[expect(clippy::disallowed_methods, reason = "the event loop's own deadlines are of this clock")]
             next_look: Instant::now(),
             wants_to_end: false,
             failure: None,

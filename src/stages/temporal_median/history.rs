@@ -119,7 +119,7 @@ mod tests {
     fn tiles_and_gray_hold_the_pixels() {
         for (width, height) in [(64, 2), (37, 41), (3, 1)] {
             let pixels: Vec<Rgb8> = (0..width * height)
-                .map(|i| [i as u8, (i * 7) as u8, (i * 31 >> 3) as u8])
+                .map(|i| [i as u8, (i * 7) as u8, ((i * 31) >> 3) as u8])
                 .collect();
             let mut history = History::default();
             history.push(&Image::filled(width, height, [9; 3]), 16);
